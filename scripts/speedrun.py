@@ -42,13 +42,11 @@ def main() -> None:
     parser.add_argument("task")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, help="agent steps at most; the task's budget by default")
-    parser.add_argument("--precision", choices=["auto", "float32", "bfloat16"], default="auto")
     parser.add_argument("--set", dest="pairs", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", help="folder of the run; a temporary one by default")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    settings = parse_settings(tuple(given.pairs), None, "sac")
-    settings |= {"bfloat16": choose_precision(given.precision) == "bfloat16"}
+    settings = {"bfloat16": choose_precision("auto") == "bfloat16"} | parse_settings(given.pairs, "sac")
     expert = paper_returns(given.task, "expert")
     if not expert:
         sys.exit(f"{given.task} has no expert in the paper's tables; give walker-walk, cheetah-run or humanoid-walk")

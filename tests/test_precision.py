@@ -58,15 +58,3 @@ def test_a_run_says_and_records_what_auto_chose(tmp_path, monkeypatch, fast):
 def test_settings_that_nothing_probed_compute_in_float32():
     assert not sac.Settings().bfloat16
     assert all("bfloat16" not in default_run(task)["settings"] for task in ("walker-walk", "ant-maze-empty7x7"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--algo", "mpo", "--precision", "float32"], "no effect with --algo mpo"),
-        (["--precision", "float32", "--set", "bfloat16=true"], "not both"),
-    ],
-)
-def test_a_precision_without_effect_is_refused(tmp_path, arguments, words):
-    run = CliRunner().invoke(main, ["train-behaviour", "walker-walk", "--out", str(tmp_path / "run"), *arguments])
-    assert run.exit_code == 2 and words in run.stderr

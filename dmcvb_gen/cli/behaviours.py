@@ -49,7 +49,7 @@ def train_behaviour(as_json, list_settings, **options):
     except Stopped as stopped:
         click.echo(stopped, err=True)
         click.get_current_context().exit(INTERRUPTED)
-    picked, layout = run.selection, options["layout"]
+    picked = run.selection
     if as_json:
         facts = dict(out=str(run.folder), steps=run.steps, seconds=round(run.seconds, 1), curve=str(run.curve))
         return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
@@ -58,7 +58,8 @@ def train_behaviour(as_json, list_settings, **options):
         return click.echo(f"Next: {_leave(options['task'])}dmcvb-gen select-checkpoints {quoted(run.folder)}")
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
-        options = f"{quoted(layout)} --level expert --behaviour {quoted(run.folder)} --goal visible"
+        maze = options["layout"] or picked.task
+        options = f"{quoted(maze)} --level expert --behaviour {quoted(run.folder)} --goal visible"
         click.echo(f"Next: dmcvb-gen rollout {options}")
 
 
@@ -69,7 +70,7 @@ def _leave(task):
     return f"{TASKS}={task} " if task and is_own(task) else ""
 
 
-def _list_settings(as_json, *, task, layout, algo, settings, config, **others):
+def _list_settings(as_json, *, task, layout, algo, settings, **others):
     """Print every setting, its value for the task and what it means."""
     from dmcvb_gen.tasks import get_task
     from dmcvb_gen.training.behaviour import task_of
@@ -77,7 +78,7 @@ def _list_settings(as_json, *, task, layout, algo, settings, config, **others):
 
     refuse(click.get_current_context(), tuple(others), "--list-settings trains nothing")
     task, algorithm = get_task(task_of(task, layout)).id, algo or ("guided" if layout else "sac")
-    given = parse_settings(settings, config, algorithm)
+    given = parse_settings(settings, algorithm)
     values = dataclasses.asdict(check_settings(algorithm, default_run(task, algorithm)["settings"] | given))
     meanings = describe_settings(algorithm)
     if as_json:
@@ -96,9 +97,8 @@ def _list_settings(as_json, *, task, layout, algo, settings, config, **others):
     "--seed", type=click.IntRange(0), default=20_000, show_default=True, help="Random seed of the fresh episodes."
 )
 @click.option("--sample", is_flag=True, help="Score sampled actions instead of the policy mean.")
-@click.option("--converged", type=float, help="Return at convergence, of a longer run.  [default: from the curve]")
 @json_option
-def select_checkpoints(run, episodes, seed, sample, converged, as_json):
+def select_checkpoints(run, episodes, seed, sample, as_json):
     """Pick the expert, medium and mixed checkpoints of a run.
 
     Expert: the first with 95 % of the return at convergence; medium: half of it (mazes: nearest to the paper's row);
@@ -112,7 +112,7 @@ def select_checkpoints(run, episodes, seed, sample, converged, as_json):
     from dmcvb_gen.training.selection import selection_json
 
     with ProgressBar(not as_json, unit=" checkpoints", desc="selection") as bar:
-        picked = select(run, episodes, seed, not sample, converged, bar)
+        picked = select(run, episodes, seed, not sample, bar)
     if as_json:
         print_json(selection_json(picked))
     else:

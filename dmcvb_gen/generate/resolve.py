@@ -316,7 +316,7 @@ def _tell_of_held_actions(recipe: Recipe, subsets: Iterable[SubsetRecord]) -> No
 
 def _policy_record(path: Path, task: Task) -> PolicyRecord:
     policy = load_policy(path, task)
-    header = policy.header.without_local_paths().model_dump(mode="json")
+    header = policy.header.model_dump(mode="json")
     header["training"].pop("curve", None)  # long, and in the policy's file
     if policy.header.algorithm == OWN_CODE:
         return PolicyRecord(name=str(path), digest=policy.digest, header=header)

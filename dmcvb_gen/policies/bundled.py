@@ -151,11 +151,6 @@ def _nothing_in(path: Path, level: str | None) -> PolicyFileError:
     what = f"{level} policy" if level else "policies"
     if why := reasons.get(level) if level else next(iter(reasons.values()), None):
         return PolicyFileError(f"{path} has no {what} selected: {why}")
-    if level == "mixed" and (strange := sorted(path.glob("mixed_*.safetensors"))):
-        return PolicyFileError(
-            f"{path} has no numbered mixed policy, only {strange[0].name}; name its files mixed_0.safetensors, "
-            "mixed_1.safetensors, ..."
-        )
     one = f", or give one checkpoint: {quoted(f'{path}@latest')}" if (path / "checkpoints").is_dir() else ""
     return PolicyFileError(
         f"{path} has no {what} selected; run `dmcvb-gen select-checkpoints {quoted(path)}` first{one}"

@@ -35,8 +35,8 @@ import pydantic
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.actor import Policy
-from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
-from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from dmcvb_gen.policies.header import PolicyHeader
+from dmcvb_gen.policies.policy_file import check_weights, load_policy, save_policy
 from dmcvb_gen.policies.sb3_zip import Facts, facts_of, predict, read_members
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
@@ -89,8 +89,6 @@ LAYOUTS = (
     Layout("cleanrl", "fc", "fc_mu", None, "relu", "deterministic", CRITICS),
     Layout("torch", "", None, None, None, None),
 )
-PROGRAMS = {"sb3": "Stable-Baselines3", "cleanrl": "CleanRL"}
-"""Algorithm of a layout -> the name of its program, for messages."""
 
 
 def converted(path: Path, task_id: str, level: str) -> Path:
@@ -138,10 +136,7 @@ def convert(
     facts = None if data is None else facts_of(path, data)
     layout, body, mean = _layout(path, state)
     if distribution is not None and layout.distribution is not None:
-        raise PolicyFileError(
-            f"--actions has no effect: {path} has an actor of {PROGRAMS[layout.algorithm]}, whose actions are known; "
-            "remove it"
-        )
+        raise PolicyFileError(f"--actions has no effect: the actions of {path} are known; remove it")
     activation = activation or (facts and facts.activation) or layout.activation
     distribution = layout.distribution or distribution
     if activation is None or distribution is None:
@@ -166,22 +161,25 @@ def convert(
         )
     weights |= _normalization(statistics, task.behaviour_size)
     normalizes = bool(weights["observation_mean"].any() or (weights["observation_std"] != 1).any())
-    header = _header(
-        path,
-        task=task_id,
-        observation=task.observation,
-        observation_size=sizes[0],
-        action_size=sizes[1],
-        algorithm=layout.algorithm,
-        agent_step=facts.steps if facts else 0,
-        level=level,
-        hidden=widths,
-        activation=activation,
-        distribution=distribution,
-        clip_observation=10.0 if normalizes else UNCLIPPED,
-        training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
-    )
-    _check_weights(path, header, weights)
+    try:
+        header = PolicyHeader(
+            task=task_id,
+            observation=task.observation,
+            observation_size=sizes[0],
+            action_size=sizes[1],
+            algorithm=layout.algorithm,
+            agent_step=facts.steps if facts else 0,
+            level=level,
+            hidden=widths,
+            activation=activation,
+            distribution=distribution,
+            clip_observation=10.0 if normalizes else UNCLIPPED,
+            training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
+        )
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise PolicyFileError(f"{path}: {first['loc'][0]}: {first['msg']}; give a smaller MLP") from None
+    check_weights(path, header, weights)
     if facts:
         _compare(path, header, weights, facts, state)
         first = "body.0.weight" if body else "mean.weight"
@@ -343,56 +341,16 @@ def _weights(
     return weights
 
 
-def _header(path: Path, **fields: Any) -> PolicyHeader:
-    try:
-        return PolicyHeader(**fields)
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(map(str, first["loc"]))
-        raise PolicyFileError(
-            f"{path} makes no policy file ({field}: {first['msg']}); give other values, or a smaller MLP"
-        ) from None
-
-
-def _check_weights(path: Path, header: PolicyHeader, weights: Mapping[str, np.ndarray]) -> None:
-    """Refuse what `load_policy` would refuse, before anything is written."""
-    for name, shape in weight_shapes(header).items():
-        if weights[name].shape != shape:
-            raise PolicyFileError(
-                f"{path}: {name} has shape {weights[name].shape}, the layers beside it ask for {shape}; save its whole "
-                "state dict again"
-            )
-        if not np.isfinite(weights[name]).all():
-            raise PolicyFileError(
-                f"{path}: {name} holds values that are not finite; its training diverged, take an earlier checkpoint"
-            )
-
-
 def _normalization(statistics: str | Path | None, size: int) -> dict[str, np.ndarray]:
-    mean, std = np.zeros(size, np.float32), np.ones(size, np.float32)
-    if statistics is not None:
-        mean, std = _statistics(statistics, size)
-        wrong = np.flatnonzero(~(np.isfinite(mean) & np.isfinite(std) & (std > 0)))
-        if len(wrong):
-            first = wrong[0]
-            raise PolicyFileError(
-                f"{statistics} has mean {mean[first]:g} and std {std[first]:g} of observation {first}; write finite "
-                "numbers and a std above 0 (1 for an observation that never changes)"
-            )
-    return {"observation_mean": mean, "observation_std": std}
-
-
-def _statistics(path: str | Path, size: int) -> list[np.ndarray]:
-    """The mean and std that a file holds, as float32."""
+    """The mean and std of observations that a file holds; 0 and 1 without one."""
+    if statistics is None:
+        return {"observation_mean": np.zeros(size, np.float32), "observation_std": np.ones(size, np.float32)}
     try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError("it is a single array")
-        with file, np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
-            return [np.asarray(file[name], np.float32).reshape(size) for name in ("mean", "std")]
-    except Exception as error:  # numpy's, zip's and zlib's own kinds
+        with np.load(statistics, allow_pickle=False) as file, np.errstate(over="ignore"):  # check_weights refuses inf
+            return {f"observation_{name}": np.asarray(file[name], np.float32).reshape(size) for name in ("mean", "std")}
+    except Exception as error:  # numpy's, zip's and zlib's own kinds, and those of a single array
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise PolicyFileError(
-            f'{path} has no "mean" and "std" of {size} observations ({reason}); write it with '
+            f'{statistics} has no "mean" and "std" of {size} observations ({reason}); write it with '
             "numpy.savez(file, mean=..., std=...)"
         ) from None

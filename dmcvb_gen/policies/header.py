@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
-import shlex
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -34,8 +32,6 @@ ORIGINS = {
 }
 """Algorithm -> how a policy of it was trained, after "trained ..."."""
 Width = Annotated[int, pydantic.Field(gt=0, le=MAX_WIDTH)]
-_PLACE = re.compile(r"[/\\~]|\.\.[/\\]|[A-Za-z]:[/\\]|file:")
-"""How a path begins that says where somebody keeps their files."""
 
 
 class _Model(pydantic.BaseModel):
@@ -118,39 +114,11 @@ class PolicyHeader(_Model):
         outside = self.algorithm == OWN_CODE or "converted_from" in self.training
         return None if outside else self.action_repeat
 
-    def without_local_paths(self) -> PolicyHeader:
-        """The header with the last names alone of paths that name a place on some machine, fit for manifests.
-
-        Files that older versions wrote say where the policy or run lay that their training started from.
-        """
-        facts = {"training": _without_local_paths(self.training), "command": _command_without_local_paths(self.command)}
-        return self.model_copy(update=facts)
-
 
 def origin_of(algorithm: str) -> str:
     """Say how policies of an algorithm are trained, in a few words that follow "trained ..."."""
     program, _, name = algorithm.partition(":")
     return f"by Stable-Baselines3's {name}" if name and program == "sb3" else ORIGINS.get(algorithm, f"by {algorithm}")
-
-
-def _without_local_paths(value: Any) -> Any:
-    """Plain values, with the last names alone of the paths among them."""
-    if isinstance(value, dict):
-        return {name: _without_local_paths(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_local_paths(inner) for inner in value]
-    if isinstance(value, str) and _PLACE.match(value):
-        return re.split(r"[/\\]", value.rstrip("/\\"))[-1]
-    return value
-
-
-def _command_without_local_paths(command: str) -> str:
-    try:
-        words = shlex.split(command)
-    except ValueError:
-        words = command.split()  # no command that a shell would take
-    bare = ["=".join(map(_without_local_paths, word.split("="))) for word in words]
-    return command if bare == words else shlex.join(bare)
 
 
 def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:

@@ -93,20 +93,31 @@ def load_policy(path: str | Path, task: Task | None = None) -> Policy:
         raise PolicyFileError(
             f"{path} sees {header.observation!r}, {task.id} shows {task.observation!r}; train it again for this task"
         )
+    check_weights(path, header, weights)
+    return Policy(header, weights, digest)
+
+
+def check_weights(path: Path, header: PolicyHeader, weights: Mapping[str, np.ndarray]) -> None:
+    """Refuse weights that are not those of a header.
+
+    Raises:
+      PolicyFileError: names and shapes differ, or values are not finite float32, or no scale of observations.
+    """
     wanted = weight_shapes(header)
-    found = {name: value.shape for name, value in weights.items()}
-    if wanted != found:
-        name = next(name for name in sorted(wanted | found) if wanted.get(name) != found.get(name))
-        raise PolicyFileError(
-            f"{path}: weight {name!r} has shape {found.get(name)}, its header asks for {wanted.get(name)}; "
-            "the file was tampered with or written by another program"
-        )
+    for name in sorted(wanted.keys() | weights.keys()):
+        shape = weights[name].shape if name in weights else None
+        if shape != wanted.get(name):
+            raise PolicyFileError(
+                f"{path}: weight {name!r} has shape {shape}, the layers beside it ask for {wanted.get(name)}; save it "
+                "whole again"
+            )
     for name, value in weights.items():
         if value.dtype != np.float32 or not np.isfinite(value).all():
-            raise PolicyFileError(f"{path}: weight {name!r} holds values that are not finite float32; export it again")
+            raise PolicyFileError(
+                f"{path}: weight {name!r} holds values that are not finite float32; take an earlier checkpoint"
+            )
     if not (weights["observation_std"] > 0).all():
-        raise PolicyFileError(f"{path}: observation_std is not positive; export it again")
-    return Policy(header, weights, digest)
+        raise PolicyFileError(f"{path}: observation_std is not positive; give 1 to observations that never change")
 
 
 def _same_family(first: str, second: str) -> bool:

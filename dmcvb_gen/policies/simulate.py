@@ -149,28 +149,17 @@ def simulate(
     most = task.most_at_once or max(1, len(chosen))
     for first in range(0, len(chosen), most):
         places = slice(first, first + most)
-        cells = None if goal_pairs is None else [goal_pairs[k] for k in out.goal_pair[places].tolist()]
-        _run(task, policies, starts[places], noise[places], cells, deterministic, threads, out.part(places))
+        part = out.part(places)
+        batch = task.batch(len(part.episodes), threads)
+        try:
+            if goal_pairs is None:
+                state = batch.reset(starts[places])
+            else:
+                state = batch.reset_fixed(starts[places], [goal_pairs[k] for k in part.goal_pair.tolist()])
+            _step_to_the_end(batch, state, policies, noise[places], deterministic, part)
+        except EpisodeError as error:
+            raise error.of_episode(int(part.episodes[error.place])) from error
     return out
-
-
-def _run(
-    task: Task,
-    policies: Sequence[Policy],
-    starts: Sequence[np.random.Generator],
-    noise: Sequence[np.random.Generator],
-    cells: Sequence[tuple] | None,
-    deterministic: bool,
-    threads: int,
-    out: Simulation,
-) -> None:
-    """Simulate the episodes of `out` side by side, and fill it; see `simulate`."""
-    batch = task.batch(len(starts), threads)
-    try:
-        state = batch.reset(starts) if cells is None else batch.reset_fixed(starts, cells)
-        _step_to_the_end(batch, state, policies, noise, deterministic, out)
-    except EpisodeError as error:
-        raise error.of_episode(int(out.episodes[error.place])) from error
 
 
 class Replay(Policy):

@@ -10,18 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Count, Local, Location, Names, Precision, Seed, checked
+from dmcvb_gen.options import Count, Local, Location, Names, Seed, checked
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.spec import MazeName, task_folder
-from dmcvb_gen.text import as_names, quoted
+from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
     from dmcvb_gen.training.run import Run, RunConfig
     from dmcvb_gen.training.selection import Selection
 
 
-SELECTION_EPISODES = 100
-"""Fresh episodes that each pick of an own maze is measured on."""
 PROBE_SECONDS = 2.0
 """How long a run is tried to say how long it will take."""
 PROBED_STEPS = 10_000
@@ -71,10 +69,8 @@ def train_behaviour(
     seed: Seed | None = None,
     algo: str | None = None,
     settings: Names = (),
-    config: Location | None = None,
     init_from: Location | None = None,
     evaluate_every: Count | None = None,
-    precision: Precision = "auto",
     resume: bool = False,
     progress: bool = True,
     notify: Callable[[str], None] = ignore,
@@ -90,14 +86,11 @@ def train_behaviour(
       seed: Random seed. [default: 0]
       algo: sac, mpo, guided (mazes), or any of SB3 and sb3-contrib, e.g. sb3:TQC. [default: sac; --layout: guided]
       settings (KEY=VALUE): Override a setting, e.g. learning_rate=0.0003.
-      config (FILE): A YAML file of settings.
       init_from (RUN|FILE): Run or policy file to start from; guided: the policy that walks.
       evaluate_every: Agent steps between evaluations, and so between checkpoints. [default: the task's]
-      precision: sac: precision of hidden layers; auto takes what the processor has instructions for.
-      resume: Resume the run in --out with its own settings.
+      resume: Resume the run in --out with its own task and settings.
 
-    `notify` is called with what the person should know: what the run will do, a resumed run without a saved state, a
-    stop. For a layout one bar counts the steps of training, evaluations and selection together.
+    `notify` is called with what the person should know: what the run will do, a stop.
 
     Raises:
       Stopped: by Ctrl-C; the run is saved, and the message has the command that goes on.
@@ -105,31 +98,38 @@ def train_behaviour(
     """
 
     from dmcvb_gen.policies.paper import paper_returns
-    from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.precision import choose_precision
+    from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.training.run import open_run, read_config
-    from dmcvb_gen.training.selection import plot_curve
+    from dmcvb_gen.training.selection import plot_curve, select_checkpoints
+    from dmcvb_gen.training.settings import parse_settings
 
-    task = task_of(task, layout)
-    get_task(task)
-    named = MazeName.parse(task)
-    folder = Path(out or Path("runs") / (named.layout if named and (layout or named.rows) else task))
+    found = read_config(out) if resume and out else None
+    task = found.task if found and not (task or layout) else task_of(task, layout)
+    maze = MazeName.parse(task)
+    own_maze = bool(maze and maze.rows)
+    folder = Path(out or Path("runs") / (maze.layout if maze and own_maze else task))
     found = read_config(folder) if resume else None
     if resume and found is None:
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
-    algorithm = algo or (found.algorithm if found else "guided" if layout else "sac")
+    algorithm = algo or (found.algorithm if found else "guided" if own_maze else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from and str(init_from))
-    asked = _settings(algorithm, as_names(settings), config, precision, found)
+    asked = parse_settings(as_names(settings), algorithm)
+    if algorithm == "sac" and not found:
+        asked = {"bfloat16": choose_precision("auto") == "bfloat16"} | asked
     run = open_run(folder, run_config(task, algorithm, asked, found, **given), resume)  # type: ignore[arg-type]
     saved = run.saved()
-    done = saved["step"] if saved else 0
-    _check_end(run, found, done, notify)
-    if resume and not saved:
-        notify(f"Nothing is saved in {folder} yet, so the run begins at step 0.")
+    done, total = saved["step"] if saved else 0, run.config.steps
+    if found and total < min(done, found.steps):  # a finished run is a few steps past its own number
+        raise DmcvbError(f"{folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
     for line in plan_of(run, done):
         notify(line)
-    picked = _train(run, done, bool(layout), progress, notify)
+    _train(run, done, progress, notify)
     expert = paper_returns(task, "expert")
-    curve = folder / "curve.png" if picked else plot_curve(folder, expert and expert["mean"])
+    curve, picked = plot_curve(folder, expert and expert["mean"]), None
+    if own_maze:
+        with ProgressBar(progress, unit=" checkpoints", desc="selection") as bar:
+            picked = select_checkpoints(folder, progress=bar)
     return TrainedRun(folder, curve, run.step, run.seconds, picked)
 
 
@@ -168,32 +168,6 @@ def task_of(task: str | None, layout: str | Path | None) -> str:
     task = task or layout_task_id(layout or "")
     allow([task])  # a person typed its name
     return task
-
-
-def _settings(algorithm: str, pairs: tuple[str, ...], config: Any, precision: str, found: Any) -> dict[str, Any]:
-    """The settings that were given, with the one that --precision decides."""
-    from dmcvb_gen.precision import choose_precision
-    from dmcvb_gen.training.settings import parse_settings
-
-    settings = parse_settings(pairs, config, algorithm)
-    if algorithm != "sac":
-        if precision != "auto":
-            raise DmcvbError(f"--precision has no effect with --algo {algorithm}: remove it")
-        return settings
-    if precision != "auto" and "bfloat16" in settings:
-        raise DmcvbError("give --precision or --set bfloat16, not both")
-    if precision == "auto" and (found or "bfloat16" in settings):
-        return settings
-    return settings | {"bfloat16": choose_precision(precision) == "bfloat16"}
-
-
-def _check_end(run: "Run", found: "RunConfig | None", done: int, notify: Callable[[str], None]) -> None:
-    """Refuse an end that is behind a run already, and say if it comes sooner than was planned."""
-    total = run.config.steps
-    if found and total < min(done, found.steps):  # a finished run is a few steps past its own number
-        raise DmcvbError(f"{run.folder} is at step {done:,}, past --steps {total:,}; give more, or leave it out")
-    if found and total < found.steps:
-        notify(f"The run ends at step {total:,} now, not at {found.steps:,}.")
 
 
 def plan_of(run: "Run", done: int = 0) -> list[str]:
@@ -259,18 +233,13 @@ def probe(run: "Run") -> float:
     return (began[-1] - began[0]) / max(len(began) - 1, 1) / run.settings.simulations
 
 
-def _train(run: "Run", done: int, select: bool, progress: bool, notify: Callable[[str], None]) -> "Selection | None":
-    """Train a run under a bar, and select its checkpoints if asked to."""
+def _train(run: "Run", done: int, progress: bool, notify: Callable[[str], None]) -> None:
+    """Train a run under a bar."""
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.progress import ProgressBar
-    from dmcvb_gen.training.selection import MAZE_CHECKPOINTS
 
-    total, episode = run.config.steps, run.task.max_steps
-    work: dict[str, float] = dict(total=total, initial=done, smoothing=0)
-    if select:  # evaluations and selection take most of its time, so their steps count as well
-        each = 1 + run.evaluation_steps
-        work |= dict(total=total * each + MAZE_CHECKPOINTS * SELECTION_EPISODES * episode, initial=done * each)
     name, expert = task_folder(run.config.task), paper_returns(run.config.task, "expert")
+    work: dict[str, float] = dict(total=run.config.steps, initial=done, smoothing=0)
     with ProgressBar(progress, **work, unit=" steps", unit_scale=True, desc=name) as bar:
         last = time.monotonic()
 
@@ -284,32 +253,8 @@ def _train(run: "Run", done: int, select: bool, progress: bool, notify: Callable
 
         def report(progress: Any) -> None:
             bar.set_postfix_str(_standing(progress, expert), refresh=False)
-            if select:
-                tick(progress.evaluation.episodes * episode)
 
         run.train(report, tick, lambda: notify("\nStopping: the run is being saved."))
-        return _select(run.folder, name, bar, SELECTION_EPISODES * episode) if select else None
-
-
-def _select(folder: Path, name: str, bar: Any, steps: int) -> "Selection":
-    """Select a run's checkpoints; the bar goes on by `steps` for each one that is measured."""
-    from dmcvb_gen.training.run import Stopped
-    from dmcvb_gen.training.selection import select_checkpoints
-
-    before = bar.n
-
-    class Rest:
-        def __call__(self, checkpoint: str) -> None:
-            bar.advance(f"{name}, selection", steps)
-
-        def expect(self, count: float) -> None:
-            bar.expect(before + count * steps)
-
-    try:
-        return select_checkpoints(folder, SELECTION_EPISODES, progress=Rest())
-    except KeyboardInterrupt:
-        command = f"dmcvb-gen select-checkpoints {quoted(folder)}"
-        raise Stopped(f"interrupted; the run is trained, select its checkpoints: {command}") from None
 
 
 def _standing(progress: Any, expert: Mapping[str, float] | None) -> str:

@@ -31,7 +31,7 @@ from dmcvb_gen.tasks.ant_maze.task import GOAL_NOISE
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
 from dmcvb_gen.training.episodes import Episodes, EpisodeSettings
 from dmcvb_gen.training.networks import WaypointNetwork, as_arrays, as_tensors
-from dmcvb_gen.training.run import Run, too_few_updates
+from dmcvb_gen.training.run import Run
 from dmcvb_gen.training.sac import RowBuffer
 from dmcvb_gen.training.settings import Count, Natural, NonNegative, Positive, Share
 
@@ -210,7 +210,6 @@ def check(run: Run) -> None:
             f"maze {layout.name} is {layout.shape[0]} x {layout.shape[1]} cells; an episode of {run.task.max_steps} "
             f"steps is too short to cross more than {MOST_CELLS} x {MOST_CELLS}, so give a smaller layout"
         )
-    too_few_updates(run, 0)
 
 
 def train(run: Run) -> None:
@@ -221,16 +220,14 @@ def train(run: Run) -> None:
     student, saved = Student(run, base), run.saved()
     episodes = Episodes(run.task, settings, run.config.seed, student.rng)
     if saved:
-        if saved["base_policy"] != base.digest:
-            raise DmcvbError(
-                f"{run.folder} was begun with another walking policy than the one here; choose another --out"
-            )
         student.load_state(saved["learner"])
         episodes.restore(saved["episodes"])
 
     def state() -> dict[str, Any]:
-        return {"learner": student.state(), "episodes": episodes.saved(), "base_policy": base.digest}
+        return {"learner": student.state(), "episodes": episodes.saved()}
 
+    if not saved:
+        run.save(state())
     while run.step < run.config.steps:
         episodes.step(student.act(episodes.observation))
         run.advance(settings.simulations)

@@ -16,7 +16,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -122,12 +122,9 @@ def kl_of_stds(std: torch.Tensor, new: torch.Tensor) -> torch.Tensor:
 class Mpo(Learner):
     """Policy, critics, their targets, temperature, multipliers; `update` does one step of all of them."""
 
-    parts = ("actor", "critic", "target", "target_actor")
-    optimizers = ("actor_optimizer", "critic_optimizer", "dual_optimizer")
-
     def __init__(self, header: PolicyHeader, settings: Settings, seed: int):
         super().__init__(header, settings, seed)
-        sizes = (header.observation_size, header.action_size, settings.critic_hidden, False, settings.critics)
+        sizes = (header.observation_size, header.action_size, settings.critic_hidden, settings.critics)
         self.critic, self.target_actor = CriticEnsemble(*sizes), copy.deepcopy(self.actor)
         self.target = copy.deepcopy(self.critic)
         for target in (self.target, self.target_actor):
@@ -135,9 +132,11 @@ class Mpo(Learner):
         # Softplus of these: they stay positive whatever the optimizer does.
         starts = (settings.initial_temperature, settings.initial_multiplier_mean, settings.initial_multiplier_std)
         self.duals = nn.Parameter(torch.tensor([value + math.log(-math.expm1(-value)) for value in starts]))
-        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=settings.learning_rate, fused=True)
-        self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=settings.learning_rate, fused=True)
-        self.dual_optimizer = torch.optim.Adam([self.duals], lr=settings.dual_learning_rate, fused=True)
+        self.optimizers = {
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=settings.learning_rate, fused=True),
+            "critic": torch.optim.Adam(self.critic.parameters(), lr=settings.learning_rate, fused=True),
+            "dual": torch.optim.Adam([self.duals], lr=settings.dual_learning_rate, fused=True),
+        }
         self._loss = compiled(self.loss) if settings.compile else self.loss
         self._logged: torch.Tensor | None = None
 
@@ -147,7 +146,8 @@ class Mpo(Learner):
         with torch.no_grad():
             values, sampled, mean, std = self._target_values(next_observation)
             target = reward + discount * values.mean(dim=0)
-        critic_loss = ((self.critic(self.actor.normalize(observation), action) - target) ** 2).mean(dim=1).sum()
+        value = self.critic(self.actor.normalize(observation), action).squeeze(-1)  # (critic, n)
+        critic_loss = ((value - target) ** 2).mean(dim=1).sum()
 
         temperature, multiplier_mean, multiplier_std = softplus(self.duals) + SMALLEST
         weights = action_weights(values, temperature).detach()
@@ -169,19 +169,18 @@ class Mpo(Learner):
         mean, std = self.target_actor(observation)
         sampled = mean + std * torch.randn(self.settings.action_samples, *mean.shape)
         repeated = self.actor.normalize(observation).expand(len(sampled), -1, -1)
-        values = self.target(repeated.flatten(0, 1), torch.tanh(sampled).flatten(0, 1))
+        values = self.target(repeated.flatten(0, 1), torch.tanh(sampled).flatten(0, 1)).squeeze(-1)
         return values.mean(dim=0).view(len(sampled), -1), sampled, mean, std
 
     def update(self, batch: dict[str, torch.Tensor]) -> None:
         """One gradient step."""
         names = ("observation", "action", "reward", "discount", "next_observation")
         batch = batch | {"reward": batch["reward"] * self.settings.reward_scale}
-        optimizers = (self.actor_optimizer, self.critic_optimizer, self.dual_optimizer)
-        for optimizer in optimizers:
+        for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
         loss, logged = self._loss(*(batch[name] for name in names))
         loss.backward()
-        for optimizer in optimizers:
+        for optimizer in self.optimizers.values():
             optimizer.step()
         self.updates += 1
         self._logged = logged
@@ -198,14 +197,6 @@ class Mpo(Learner):
         """Losses, temperature, KL divergences and mean deviation of the last update."""
         names = ("critic_loss", "actor_loss", "temperature", "kl_mean", "kl_std", "std")
         return {} if self._logged is None else dict(zip(names, self._logged.tolist(), strict=True))
-
-    def state(self) -> dict[str, Any]:
-        return super().state() | {"duals": self.duals.detach()}
-
-    def load_networks(self, state: Mapping[str, Any]) -> None:
-        super().load_networks(state)
-        with torch.no_grad():
-            self.duals.copy_(state["duals"])
 
     def load_actor(self, weights: Mapping[str, torch.Tensor]) -> None:
         super().load_actor(weights)

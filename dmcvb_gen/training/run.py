@@ -8,10 +8,10 @@ A run folder holds
     resume/state.safetensors              learner, replay buffer, simulations, random states
     selected/, selection.json, curve.png  written by the selection
 
-The state is saved every ten minutes, at Ctrl-C and at the end, aside and renamed, so that a process that dies or a disk
-that fills up leaves the previous one. What was logged after it is dropped when a run goes on, and made again: with the
-same versions of torch and numpy, the same processor and one thread, a run of the package's own algorithms that was
-stopped or killed gives the same bits as one that never was.
+The state is saved at the start, every ten minutes, at Ctrl-C and at the end, aside and renamed, so that a process that
+dies or a disk that fills up leaves the previous one. What was logged after it is dropped when a run goes on, and made
+again: with the same versions of torch and numpy, the same processor and one thread, a run of the package's own
+algorithms that was stopped or killed gives the same bits as one that never was.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import dataclasses
 import json
 import os
 import shlex
-import shutil
 import signal
 import threading
 import time
@@ -41,14 +40,14 @@ from dmcvb_gen.policies.bundled import checkpoints
 from dmcvb_gen.policies.evaluation import evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
-from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION, MazeName
+from dmcvb_gen.spec import ANT_MAZE, LOCOMOTION, is_maze
 from dmcvb_gen.state_file import STATE, pack_state, read_state_file
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import useless_setting
 from dmcvb_gen.training.networks import as_arrays, as_tensors
-from dmcvb_gen.training.run_log import RunLog, read_rows
+from dmcvb_gen.training.run_log import RunLog
 from dmcvb_gen.training.settings import algorithm_module, check_settings
 
 EVALUATION_EPISODES = 20
@@ -59,9 +58,6 @@ not in seconds, so that a run gives the same bits however busy its machine is.""
 SAVE_SECONDS = 600
 """Seconds after which the state to resume from is saved again: a process that is killed loses these."""
 
-FREE = ("steps", "settings", "init_sha256")
-"""Fields of a run's configuration in which one that goes on need not be written as it was."""
-
 Weights = Mapping[str, torch.Tensor]
 Report = Callable[["Progress"], None]
 ProgressCallback = Callable[[int], Any]
@@ -69,13 +65,13 @@ ProgressCallback = Callable[[int], Any]
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
-    """Config of a run, in its run.json; a run that goes on must have the same, but for `FREE`.
+    """Config of a run, in its run.json; a run that goes on must have the same, but for its steps.
 
     Attributes:
       steps: agent steps (at action repeat 2) to train; a resumed run may have more.
       evaluate_every: agent steps between evaluations, and so between checkpoints.
       init_from: policy file or run whose actor, critics and normalization it starts from.
-      init_sha256: of that file as it was when the run began, if it is a file.
+      init_sha256: of that file, if it is a file.
     """
 
     task: str
@@ -150,11 +146,10 @@ def read_state(folder: str | Path) -> dict[str, Any] | None:
 def check_same(folder: Path, found: RunConfig, asked: RunConfig) -> None:
     """Refuse to mix two configurations in one folder; only `steps` may differ.
 
-    What the run started from is as it was then, whatever lies there by now. Settings are compared with their defaults
-    filled in, so that naming a default is no difference.
+    Settings are compared with their defaults filled in, so that naming a default is no difference.
     """
     was, now = (
-        {name: value for name, value in vars(config).items() if name not in FREE}
+        dataclasses.asdict(dataclasses.replace(config, steps=0, init_sha256=None, settings={}))
         | dataclasses.asdict(check_settings(config.algorithm, config.settings))
         for config in (found, asked)
     )
@@ -186,10 +181,9 @@ class Run:
         self.evaluation_steps = getattr(self.algorithm, "EVALUATION_STEPS", EVALUATION_STEPS[self.task.family])
         self.episodes_at_most = EVALUATION_EPISODES * getattr(self.algorithm, "TIMES_MORE_EPISODES", 1)
         network = self.algorithm.network(self)
-        origin = {"init_from": config.init_name}
+        training = {"settings": dataclasses.asdict(self.settings), "seed": config.seed, "init_from": config.init_name}
         if config.init_sha256:
-            origin["init_sha256"] = config.init_sha256
-        settings = dataclasses.asdict(self.settings)
+            training["init_sha256"] = config.init_sha256
         self.header = PolicyHeader(
             task=self.task.id,
             observation=self.task.observation,
@@ -197,8 +191,7 @@ class Run:
             action_size=self.task.action_size,
             algorithm=config.algorithm,
             agent_step=0,
-            training={"settings": settings, "seed": config.seed, **origin, "environment": environment()}
-            | network.pop("training", {}),
+            training=training | {"environment": environment()} | network.pop("training", {}),
             command=command_of(dataclasses.replace(config, init_from=config.init_name)),
             **network,
         )
@@ -244,8 +237,11 @@ class Run:
             with self._alone():
                 self.write_config()
                 saved = self.saved()
-                if not saved:
-                    self._refuse_lost_state()
+                if not saved and checkpoints(self.folder):
+                    raise DmcvbError(
+                        f"{self.folder} has checkpoints, but nothing to resume from (resume/{STATE} is gone); choose "
+                        "another --out"
+                    )
                 self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
                 self._drop_later_checkpoints()
                 self._log = RunLog(self.folder, self.step)
@@ -267,13 +263,8 @@ class Run:
         write_json(self.folder / "run.json", json.loads(json.dumps(dataclasses.asdict(self.config))))
 
     def resume_command(self) -> str:
-        """The command line that resumes this run."""
-        what = [self.config.task]
-        maze = MazeName.parse(self.config.task)
-        if maze and maze.rows and not maze.reward:  # the layout's name is short, its rows are not
-            path = self.folder / f"{maze.layout}.txt"
-            path.write_text(maze.rows.replace("/", "\n").replace(".", " ") + "\n")
-            what = ["--layout", str(path)]
+        """The command line that resumes this run; a maze of one's own has a long name."""
+        what = [] if is_maze(self.config.task) else [self.config.task]
         return shlex.join(["dmcvb-gen", "train-behaviour", *what, "--out", str(self.folder), "--resume"])
 
     # -- what algorithms use ----------------------------------------------------------------
@@ -300,10 +291,9 @@ class Run:
         self._began = time.time()
 
     def evaluation_episodes(self) -> int:
-        """Episodes of the evaluation after the steps trained since the one before, so that all keep to their share."""
-        before = self._log.curve if self._log else {}
-        since = self.step - max((step for step in before if step < self.step), default=0)
-        return int(np.clip(self.evaluation_steps * since / self.task.max_steps, 1, self.episodes_at_most))
+        """Episodes of an evaluation, so that all keep to their share of the steps."""
+        fit = self.evaluation_steps * self.config.evaluate_every / self.task.max_steps
+        return int(np.clip(fit, 1, self.episodes_at_most))
 
     def save(self, state: dict[str, Any]) -> None:
         """Put the state to resume from in place of the previous one, whole or not at all."""
@@ -348,18 +338,7 @@ class Run:
             if step > self.step:
                 path.unlink()
         for folder in ("checkpoints", "resume"):
-            for path in (self.folder / folder).glob("*.partial"):
-                path.unlink()
             remove_partial(self.folder / folder)
-
-    def _refuse_lost_state(self) -> None:
-        """Raise if a run has trained for longer than it takes to save it, and its saved state is gone."""
-        rows = read_rows(self.folder)
-        if rows and float(rows[-1]["seconds"] or 0) > 2 * SAVE_SECONDS:
-            raise DmcvbError(
-                f"{self.folder} has checkpoints, but nothing to resume from (resume/{STATE} is gone); choose another "
-                "--out, or delete checkpoints/ and progress.csv to begin anew"
-            )
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
@@ -404,27 +383,6 @@ class Run:
                 signal.signal(number, handler)
 
 
-def too_few_updates(run: Run, warmup: int, needed: int = 1) -> None:
-    """Refuse a run whose steps are all warm-up, or whose updates come to less than the policy needs to change once.
-
-    Args:
-      warmup: agent steps before the first update; `updates_per_step` come for every one after.
-      needed: updates until the policy changes.
-    """
-    steps, together, rate = run.config.steps, run.settings.simulations, run.settings.updates_per_step
-    if steps <= warmup:
-        raise DmcvbError(
-            f"{steps} steps are all warm-up ({warmup} steps), nothing would be learned; give more --steps, or less "
-            "warm-up: --set warmup_steps=N"
-        )
-    rounds = -(-steps // together) - max(-(-warmup // together), 1) + 1
-    if rounds * together * rate < needed:
-        raise DmcvbError(
-            f"{steps} steps come to {rounds * together * rate:.3g} updates and the policy changes after {needed}, so "
-            "nothing would be learned; give more --steps, or a higher --set updates_per_step"
-        )
-
-
 def start_from(learner: Any, run: Run) -> None:
     """Take networks and normalization of the run that `init_from` names, or the actor alone of a policy file.
 
@@ -433,40 +391,21 @@ def start_from(learner: Any, run: Run) -> None:
     """
     source = str(run.config.init_from)
     try:
-        if not Path(source).is_dir():
-            learner.load_actor(as_tensors(policy_to_start_from(source, run.header).weights))
-            return
-        config = read_config(source)
-        saved = read_state(source) if config and config.algorithm == run.config.algorithm else None
-        if not saved:
-            raise DmcvbError(
-                f"--init-from {source}: no run of {run.config.algorithm} is saved there; give its folder or a "
-                "policy file"
-            )
-        learner.load_networks(saved["learner"])
+        if Path(source).is_dir():
+            config, saved = read_config(source), read_state(source)
+            if not (config and saved and config.algorithm == run.config.algorithm):
+                raise DmcvbError(
+                    f"--init-from {source}: no run of {run.config.algorithm} is saved there; give its folder or a "
+                    "policy file"
+                )
+            return learner.load_networks(saved["learner"])
+        policy = load_policy(source)
+        if policy.header.activation != run.header.activation:
+            raise RuntimeError(f"activation {policy.header.activation}, expected {run.header.activation}")
+        learner.load_actor(as_tensors(policy.weights))
     except (RuntimeError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
         raise DmcvbError(f"--init-from {source}: its networks do not fit these settings and task ({reason})") from None
-
-
-def policy_to_start_from(source: str | Path, header: PolicyHeader) -> Policy:
-    """The policy file that a run starts from.
-
-    Args:
-      header: of the run's own policies.
-
-    Raises:
-      DmcvbError: its network computes something else than the run's, though its weights may fit.
-    """
-    policy = load_policy(source)
-    for field in ("activation", "layer_norm", "way"):
-        theirs, ours = getattr(policy.header, field), getattr(header, field)
-        if theirs != ours:
-            raise DmcvbError(
-                f"--init-from {source}: its network has {field} {theirs} and that of {header.algorithm} {ours}, so it "
-                "would act otherwise; start from a policy of the same kind"
-            )
-    return policy
 
 
 def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
@@ -474,7 +413,7 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
 
     Raises:
       DmcvbError: the folder holds another configuration, or a run and `resume` was not asked for; settings are
-        unknown or wrong; there is too little room on the disk.
+        unknown or wrong.
     """
     folder = local_path(folder)
     found = read_config(folder)
@@ -484,28 +423,16 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         check_same(folder, found, config)
     elif folder.is_file() or (folder.exists() and any(folder.iterdir())):
         raise DmcvbError(f"{folder} is not empty and holds no run; choose another --out")
-    digest = _digest_of_start(folder, config, found)
-    run = Run(folder, dataclasses.replace(config, init_sha256=found.init_sha256 if found else digest))
+    source = Path(config.init_from) if config.init_from and not found else None
+    if source and not source.is_file() and not read_config(source):
+        raise DmcvbError(f"--init-from {source} is neither a run folder nor a policy file")
+    digest = found.init_sha256 if found else sha256_file(source) if source and source.is_file() else None
+    run = Run(folder, dataclasses.replace(config, init_sha256=digest))
     if problem := useless_setting(run.task, run.settings):
         raise DmcvbError(problem)
     run.algorithm.check(run)
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
-        if shutil.disk_usage(folder).free < 1e9:
-            raise DmcvbError(f"less than 1 GB is free at {folder}; make room, a run needs it for its replay buffer")
         if not found:  # a run that goes on writes it once it is alone in the folder
             run.write_config()
     return run
-
-
-def _digest_of_start(folder: Path, config: RunConfig, found: RunConfig | None) -> str | None:
-    """SHA-256 of the policy file that a run starts from, None if it starts from none; refuses one that is not there."""
-    source = config.init_from
-    if not source or (found and (folder / "resume" / STATE).exists()):
-        return None
-    if not Path(source).is_file() and not read_config(source):
-        raise DmcvbError(f"--init-from {source} is neither a run folder nor a policy file")
-    digest = sha256_file(source) if Path(source).is_file() else None
-    if found and digest and found.init_sha256 not in (None, digest):
-        raise DmcvbError(f"{source} is no longer the file that {folder} began with; choose another --out")
-    return digest

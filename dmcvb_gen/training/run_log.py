@@ -41,18 +41,13 @@ def _write(file, rows) -> None:
 
 
 class RunLog:
-    """Appends to the logs of a run that goes on at `step`; what was logged after it is made again.
-
-    Attributes:
-      curve: agent step -> return of every evaluation.
-    """
+    """Appends to the logs of a run that goes on at `step`; what was logged after it is made again."""
 
     def __init__(self, folder: Path, step: int):
         from torch.utils.tensorboard import SummaryWriter
 
         self._path = folder / "progress.csv"
         rows = [row for row in read_rows(folder) if int(row["step"]) <= step]
-        self.curve = {int(row["step"]): float(row["return_mean"]) for row in rows}
         remove_partial(folder)  # of a process that was killed
         with replacing(self._path) as temporary, temporary.open("w", newline="") as file:
             csv.DictWriter(file, COLUMNS, lineterminator="\n").writeheader()
@@ -70,7 +65,6 @@ class RunLog:
         row |= {"step": step, "seconds": round(seconds, 1), "updates": updates}
         with self._path.open("a", newline="") as file:
             _write(file, [row])
-        self.curve[step] = evaluation.mean
         for name, value in known.items():
             if name != "alpha":
                 self._board.add_scalar(f"evaluation/{name}", value, step)

@@ -32,7 +32,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
 from dmcvb_gen.training.episodes import Episodes, Moment, RewardedEpisodeSettings
 from dmcvb_gen.training.networks import Actor
-from dmcvb_gen.training.run import Run, start_from, too_few_updates
+from dmcvb_gen.training.run import Run, start_from
 from dmcvb_gen.training.settings import Count, Decay, Hidden, Natural, NonNegative, Positive, Share
 
 # -- settings -------------------------------------------------------------------------------------
@@ -57,12 +57,6 @@ class Settings(RewardedEpisodeSettings):
       discount: discount of an agent step.
       actor_every: an actor update every so many critic updates.
       target_decay: share of the target critics that an update keeps.
-      clipped: targets and actor use the smallest critic's value (off: their mean, less pessimistic, which hard
-        tasks want).
-      soft_values: targets hold the entropy bonus of later steps, as in SAC. Without it critics give returns alone, so
-        that their range does not depend on the action size, and entropy only regularizes the actor.
-      bins: critics give a distribution over so many returns and learn it by cross-entropy; 0: they give a number and
-        learn by squared error.
       reward_scale: multiplies rewards before learning; 0: the inverse of the spread of discounted returns, as it grows.
       n_step: rewards summed before a target bootstraps, on the way that the episode really took.
       n_step_half_life: the share of such targets is 1 / (1 + agent steps / this), others look one step ahead (0: all of
@@ -93,9 +87,6 @@ class Settings(RewardedEpisodeSettings):
     discount: Decay = 0.99
     actor_every: Count = 2
     target_decay: Decay = 0.995
-    clipped: bool = False
-    soft_values: bool = False
-    bins: Natural = 101
     reward_scale: NonNegative = 0.0
     n_step: Count = 3
     n_step_half_life: Natural = 10_000
@@ -111,8 +102,10 @@ class Settings(RewardedEpisodeSettings):
 
 RETURN_LIMIT = 5.0
 """Scaled discounted returns stay within this: the largest seen is scaled to it if the spread alone does not."""
+BINS = 101
+"""Returns over which critics give a distribution."""
 SUPPORT = 1.2 * RETURN_LIMIT
-"""Largest absolute return of the bins; the entropy bonus needs some room."""
+"""Largest absolute return of the bins."""
 SMOOTHING = 0.75
 """Standard deviation of a target's smoothing over bins, in bins (Farebrother et al. 2024, section 3)."""
 
@@ -276,10 +269,10 @@ class ReplayBuffer(RowBuffer):
 
 
 class CriticEnsemble(nn.Module):
-    """Critics Q(observation, action), evaluated in one batched product; LayerNorm after each hidden layer.
+    """Critics of (observation, action), evaluated in one batched product; LayerNorm after each hidden layer.
 
     Args:
-      bins: outputs of a critic's head, see `Settings.bins`.
+      outputs: numbers that a critic gives: the logits of a distribution over returns, or one value.
     """
 
     def __init__(
@@ -287,12 +280,12 @@ class CriticEnsemble(nn.Module):
         observation_size: int,
         action_size: int,
         hidden: tuple[int, ...],
-        bfloat16: bool,
         critics: int = 2,
-        bins: int = 0,
+        outputs: int = 1,
+        bfloat16: bool = False,
     ):
         super().__init__()
-        self.bfloat16, self.bins = bfloat16, bins
+        self.bfloat16 = bfloat16
         sizes = (observation_size + action_size, *hidden)
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         self.scales, self.shifts = nn.ParameterList(), nn.ParameterList()
@@ -301,37 +294,11 @@ class CriticEnsemble(nn.Module):
             self.biases.append(nn.Parameter(torch.zeros(critics, 1, o)))
             self.scales.append(nn.Parameter(torch.ones(critics, 1, o)))
             self.shifts.append(nn.Parameter(torch.zeros(critics, 1, o)))
-        outputs = max(bins, 1)
         self.head = nn.Parameter(torch.stack([_init(sizes[-1], outputs) for _ in range(critics)]) * 0.1)
         self.head_bias = nn.Parameter(torch.zeros(critics, 1, outputs))
-        if bins:
-            edges = torch.linspace(-SUPPORT, SUPPORT, bins + 1)
-            self.register_buffer("edges", edges, persistent=False)
-            self.register_buffer("centers", (edges[1:] + edges[:-1]) / 2, persistent=False)
 
     def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """(n, observation), (n, action) -> (critic, n) values."""
-        outputs = self.outputs(observation, action)
-        if not self.bins:
-            return outputs.squeeze(-1)
-        return (outputs.softmax(dim=-1) * self.centers).sum(dim=-1)
-
-    def loss(self, observation: torch.Tensor, action: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """(1): cross-entropy of targets (n,), or squared error, its mean over rows and sum over critics.
-
-        HL-Gauss: a target is a Gaussian around it, of which each bin holds its part.
-        """
-        outputs = self.outputs(observation, action)
-        if not self.bins:
-            return ((outputs.squeeze(-1) - target) ** 2).mean(dim=1).sum()
-        width = 2 * SUPPORT / self.bins
-        target = target.clamp(-SUPPORT + width, SUPPORT - width)
-        below = torch.erf((self.edges - target[:, None]) / (math.sqrt(2) * SMOOTHING * width))
-        wanted = (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])  # (n, bin), one in sum
-        return -(wanted * outputs.log_softmax(dim=-1)).sum(dim=-1).mean(dim=1).sum()
-
-    def outputs(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """(n, observation), (n, action) -> (critic, n, max(bins, 1))."""
+        """(n, observation), (n, action) -> (critic, n, output)."""
         x = torch.cat([observation, action], dim=1).expand(len(self.head), -1, -1)
         for weight, bias, scale, shift in zip(self.weights, self.biases, self.scales, self.shifts, strict=True):
             if self.bfloat16:
@@ -348,23 +315,35 @@ def _init(inputs: int, outputs: int) -> torch.Tensor:
     return torch.empty(inputs, outputs).uniform_(-bound, bound)
 
 
+def smoothed(target: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:
+    """(n,) -> (n, bin): HL-Gauss: a Gaussian around each target, of which each bin holds its part, one in sum.
+
+    Args:
+      edges: (bin + 1,) of the bins, evenly spaced.
+    """
+    width = 2 * SUPPORT / (len(edges) - 1)
+    target = target.clamp(-SUPPORT + width, SUPPORT - width)
+    below = torch.erf((edges - target[:, None]) / (math.sqrt(2) * SMOOTHING * width))
+    return (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])
+
+
 # -- the learner ----------------------------------------------------------------------------------
 
 
-class Learner:
-    """An actor with the running statistics of its observations, and the state of all networks beside it.
+class Learner(nn.Module):
+    """An actor with the running statistics of its observations; subclasses add networks and optimizers.
 
-    Attributes of subclasses:
-      parts, optimizers: names of the networks and optimizers that `state` holds.
+    Attributes:
+      optimizers: name -> optimizer.
+      updates: gradient updates so far.
     """
 
-    parts: tuple[str, ...]
-    optimizers: tuple[str, ...]
-
     def __init__(self, header: PolicyHeader, settings: Any, seed: int):
+        super().__init__()
         torch.manual_seed(seed)
         self.settings, self.actor = settings, Actor(header)
         self.norm = RunningNorm(header.observation_size)
+        self.optimizers: dict[str, torch.optim.Optimizer] = {}
         self.updates = 0
 
     def sync_norm(self) -> None:
@@ -382,15 +361,16 @@ class Learner:
 
     def state(self) -> dict[str, Any]:
         """Everything that learning continues from (tensors and plain numbers)."""
-        states = {name: getattr(self, name).state_dict() for name in (*self.parts, *self.optimizers)}
-        return states | {"norm": self.norm.state(), "updates": self.updates, "torch_rng": torch.get_rng_state()}
+        optimizers = {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()}
+        random = {"updates": self.updates, "torch_rng": torch.get_rng_state()}
+        return {"networks": self.state_dict(), "norm": self.norm.state(), "optimizers": optimizers} | random
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Continue from `state()`."""
         self.load_networks(state)
-        for name in self.optimizers:
-            getattr(self, name).load_state_dict(state[name])
-        self.updates = int(state["updates"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.updates = state["updates"]
         torch.set_rng_state(state["torch_rng"])
 
     def load_networks(self, state: Mapping[str, Any]) -> None:
@@ -399,8 +379,7 @@ class Learner:
         Raises:
           RuntimeError: they have other shapes.
         """
-        for name in self.parts:
-            getattr(self, name).load_state_dict(state[name])
+        self.load_state_dict(state["networks"])
         self.norm.load_state(state["norm"])
 
     def load_actor(self, weights: Mapping[str, torch.Tensor]) -> None:
@@ -417,25 +396,24 @@ class Learner:
 class Sac(Learner):
     """Networks, optimizers, temperature; `update` does one step of all of them."""
 
-    parts = ("actor", "critic", "target")
-    optimizers = ("actor_optimizer", "critic_optimizer", "alpha_optimizer")
-
     def __init__(self, header: PolicyHeader, settings: Settings, seed: int):
         super().__init__(header, settings, seed)
-        observation, action = header.observation_size, header.action_size
-        sizes = (observation, action, settings.critic_hidden, settings.bfloat16, settings.critics, settings.bins)
-        self.critic, self.target = CriticEnsemble(*sizes), CriticEnsemble(*sizes)
+        sizes = (header.observation_size, header.action_size, settings.critic_hidden, settings.critics, BINS)
+        self.critic, self.target = (CriticEnsemble(*sizes, settings.bfloat16) for _ in range(2))
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(settings.initial_temperature)))
         self.returns = ReturnScale(settings.simulations, settings.discount)
-        self.target_entropy = -settings.target_entropy_scale * action
-        self._final_entropy = -settings.final_entropy_scale * action
+        self.edges = torch.linspace(-SUPPORT, SUPPORT, BINS + 1)
+        self.centers = (self.edges[1:] + self.edges[:-1]) / 2
+        self.target_entropy = -settings.target_entropy_scale * header.action_size
         rate = settings.learning_rate
         decay = {"weight_decay": settings.weight_decay, "fused": True}
-        self.actor_optimizer = torch.optim.AdamW(self.actor.parameters(), lr=rate, **decay)
-        self.critic_optimizer = torch.optim.AdamW(self.critic.parameters(), lr=rate, **decay)
-        self.alpha_optimizer = torch.optim.Adam([self.log_alpha], lr=rate, fused=True)
+        self.optimizers = {
+            "actor": torch.optim.AdamW(self.actor.parameters(), lr=rate, **decay),
+            "critic": torch.optim.AdamW(self.critic.parameters(), lr=rate, **decay),
+            "alpha": torch.optim.Adam([self.log_alpha], lr=rate, fused=True),
+        }
         self._losses: dict[str, torch.Tensor] = {}
         self._critic_loss = compiled(self.critic_loss) if settings.compile else self.critic_loss
         self._actor_loss = compiled(self.actor_loss) if settings.compile else self.actor_loss
@@ -445,15 +423,13 @@ class Sac(Learner):
         settings, rate = self.settings, self.settings.learning_rate
         if settings.rate_half_life:
             rate /= math.sqrt(1 + step / settings.rate_half_life)
-        annealed = settings.anneal_after and step >= settings.anneal_after
-        networks = [self.actor_optimizer, self.critic_optimizer]
-        if annealed:
-            self.target_entropy, rate = self._final_entropy, settings.final_learning_rate or rate
+        networks = ["actor", "critic"]
+        if settings.anneal_after and step >= settings.anneal_after:
+            self.target_entropy = -settings.final_entropy_scale * self.actor.header.action_size
             if settings.final_learning_rate:
-                networks.append(self.alpha_optimizer)
-        for optimizer in networks:
-            for group in optimizer.param_groups:
-                group["lr"] = rate
+                rate, networks = settings.final_learning_rate, [*networks, "alpha"]
+        for name in networks:
+            self.optimizers[name].param_groups[0]["lr"] = rate
 
     def sample_action(self, normalized: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Reparametrized action and its log probability, (n, action), (n,)."""
@@ -471,26 +447,24 @@ class Sac(Learner):
         log_prob = log_prob - 2 * (math.log(2) - before - nn.functional.softplus(-2 * before))
         return action, log_prob.sum(dim=1)
 
-    def reduce(self, values: torch.Tensor) -> torch.Tensor:
-        """(critic, n) -> (n,): the value that targets and the actor believe."""
-        return values.min(dim=0).values if self.settings.clipped else values.mean(dim=0)
+    def value(self, critic: CriticEnsemble, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """(n,): the mean of the returns that critics expect, and of the critics."""
+        return (critic(observation, action).softmax(dim=-1) * self.centers).sum(dim=-1).mean(dim=0)
 
     def critic_loss(self, observation, action, reward, discount, next_observation):
-        """Return the loss of the critics against their Bellman targets, (1)."""
+        """Return the cross-entropy of the Bellman targets, (1): its mean over rows and sum over critics."""
         with torch.no_grad():
             next_observation = self.actor.normalize(next_observation)
-            next_action, log_prob = self.sample_action(next_observation)
-            next_value = self.reduce(self.target(next_observation, next_action))
-            if self.settings.soft_values:
-                next_value = next_value - self.log_alpha.exp() * log_prob
-            target = reward + discount * next_value
-        return self.critic.loss(self.actor.normalize(observation), action, target)
+            next_action, _ = self.sample_action(next_observation)
+            target = reward + discount * self.value(self.target, next_observation, next_action)
+        logits = self.critic(self.actor.normalize(observation), action)  # (critic, n, bin)
+        return -(smoothed(target, self.edges) * logits.log_softmax(dim=-1)).sum(dim=-1).mean(dim=1).sum()
 
     def actor_loss(self, observation):
         """E[alpha log pi - Q] and the mean log probability."""
         observation = self.actor.normalize(observation)
         action, log_prob = self.sample_action(observation)
-        value = self.reduce(self.critic(observation, action))
+        value = self.value(self.critic, observation, action)
         return (self.log_alpha.exp().detach() * log_prob - value).mean(), log_prob.mean()
 
     def update(self, batch: dict[str, torch.Tensor]) -> None:
@@ -503,22 +477,22 @@ class Sac(Learner):
             batch["discount"],
             batch["next_observation"],
         )
-        self.critic_optimizer.zero_grad(set_to_none=True)
+        self.optimizers["critic"].zero_grad(set_to_none=True)
         loss.backward()
-        self.critic_optimizer.step()
+        self.optimizers["critic"].step()
         self._losses["critic_loss"] = loss.detach()
         self.updates += 1
         if self.updates % settings.actor_every == 0:
             self.critic.requires_grad_(False)
             loss, log_prob = self._actor_loss(batch["observation"])
-            self.actor_optimizer.zero_grad(set_to_none=True)
+            self.optimizers["actor"].zero_grad(set_to_none=True)
             loss.backward()
-            self.actor_optimizer.step()
+            self.optimizers["actor"].step()
             self.critic.requires_grad_(True)
             self._losses |= {"actor_loss": loss.detach(), "entropy": -log_prob.detach()}
-            self.alpha_optimizer.zero_grad(set_to_none=True)
+            self.optimizers["alpha"].zero_grad(set_to_none=True)
             (-self.log_alpha.exp() * (log_prob.detach() + self.target_entropy)).backward()
-            self.alpha_optimizer.step()
+            self.optimizers["alpha"].step()
         torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
 
     def metrics(self) -> dict[str, float]:
@@ -528,16 +502,11 @@ class Sac(Learner):
         }
 
     def state(self) -> dict[str, Any]:
-        return super().state() | {"log_alpha": self.log_alpha.detach(), "returns": self.returns.state()}
+        return super().state() | {"returns": self.returns.state()}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         super().load_state(state)
         self.returns.load_state(state["returns"])
-
-    def load_networks(self, state: Mapping[str, Any]) -> None:
-        super().load_networks(state)
-        with torch.no_grad():
-            self.log_alpha.copy_(state["log_alpha"])
 
 
 # -- the run --------------------------------------------------------------------------------------
@@ -562,8 +531,10 @@ class Collector:
             self.buffer.load_state(saved["buffer"])
             self.episodes.restore(saved["episodes"])
             self.rng.bit_generator.state, self._owed = json.loads(saved["rng"]), saved["owed"]
-        elif config.init_from:
-            start_from(learner, run)
+        else:
+            if config.init_from:
+                start_from(learner, run)
+            run.save(self.state())
 
     def state(self) -> dict[str, Any]:
         """Everything that the run continues from."""
@@ -598,19 +569,14 @@ class Collector:
             yield self.buffer.sample_steps(self.rng, settings.batch_size, settings.n_step, settings.discount, share)
 
 
-def check_replay(run: Run, kind: Callable[..., Learner], updates: int = 1) -> None:
-    """Refuse a run of a learner that would learn nothing, or that its start does not fit.
-
-    Args:
-      kind: makes the learner. updates: until its policy changes.
-    """
-    settings = run.settings
-    if settings.buffer_size < settings.warmup_steps:
+def check_replay(run: Run, kind: Callable[..., Learner]) -> None:
+    """Refuse a run of a learner, which `kind` makes, that would learn nothing, or that its start does not fit."""
+    settings, steps = run.settings, min(run.config.steps, run.settings.buffer_size)
+    if steps <= settings.warmup_steps:
         raise DmcvbError(
-            f"buffer_size {settings.buffer_size} holds fewer steps than warmup_steps {settings.warmup_steps}, so "
-            "nothing would ever be learned; give --set buffer_size of at least that"
+            f"{steps} steps are all warm-up ({settings.warmup_steps} steps), nothing would be learned; give more "
+            "--steps (or buffer_size), or less warm-up: --set warmup_steps=N"
         )
-    too_few_updates(run, settings.warmup_steps, updates)
     if run.config.init_from and not run.begun:
         start_from(kind(run.header, settings, run.config.seed), run)
 
@@ -626,7 +592,7 @@ def check(run: Run) -> None:
     Raises:
       DmcvbError: what is wrong and the cure.
     """
-    check_replay(run, Sac, run.settings.actor_every)
+    check_replay(run, Sac)
 
 
 def train(run: Run) -> None:

@@ -155,6 +155,8 @@ def train(run: Run) -> None:
     run.header = run.header.model_copy(update=export(run, model)[1])
     if saved := run.saved():
         restore(model, saved)
+    else:
+        run.save(state_of(model))
 
     def after_step(*_: Any) -> bool:
         run.advance(run.settings.simulations)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -46,8 +45,8 @@ PAPER_TOLERANCE = 0.2
 """How far (as a share of it) a maze's medium may be from the paper's return."""
 CANDIDATES = 8
 """Checkpoints near a medium's return that are measured on fresh episodes."""
-MAZE_CHECKPOINTS = 2 * CANDIDATES
-"""Checkpoints of a maze that are measured, about: near its expert's return and near its medium's."""
+MEASURED = 14
+"""Checkpoints that are measured, about."""
 BASE_EPISODES = 20
 """Episodes of random actions, which tell where returns start that may be negative."""
 COST_SLACK = 0.3
@@ -186,58 +185,40 @@ def read_curve(folder: str | Path) -> list[Point]:
 
 
 def pick_checkpoints(
-    curve: Sequence[Point],
-    base: float,
-    convergence: Convergence,
-    measure: Callable[[Path], Evaluation],
-    task: str = "",
-    levels: Sequence[str] = TRAINED_LEVELS,
-    medium: float | None = None,
-    costs: bool = False,
+    task: str, curve: Sequence[Point], base: float, convergence: Convergence, measure: Callable[[Path], Evaluation]
 ) -> Selection:
-    """Pick levels from a curve; every pick is measured on fresh episodes before it is accepted.
+    """Pick a task's levels from a curve; every pick is measured on fresh episodes before it is accepted.
 
     Args:
+      task: its id; mazes have no mixed level, and returns that are costs.
       curve: (agent step, return, policy file), in order of steps.
       base: return at 0 % of the way.
       measure: evaluates a policy file on fresh episodes.
-      levels: levels to pick, out of `TRAINED_LEVELS`.
-      medium: return that medium is to have; None: half of the way.
-      costs: returns are negative, as in mazes: an expert's is `convergence` over the share, not so much of the way.
     """
-    way, check = convergence.value - base, functools.cache(measure)
-    if not curve or not way > 0:
-        return Selection(task, base, convergence, {}, dict.fromkeys(levels, _nothing(curve, base, convergence)))
+    way, check, maze = convergence.value - base, functools.cache(measure), is_maze(task)
+    levels = MAZE_TRAINED_LEVELS if maze else TRAINED_LEVELS
+    if not way > 0:
+        return Selection(task, base, convergence, {}, dict.fromkeys(levels, convergence.reason))
     found: dict[str, tuple[Pick, ...] | str] = {}
     if not convergence.converged:
         found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"
-    elif costs and convergence.value < 0:  # 95 % of the way from a random policy's return costs half again as much
+    elif maze and convergence.value < 0:  # 95 % of the way from a random policy's return costs half again as much
         goal = convergence.value / EXPERT_SHARE
         found["expert"] = _expert(curve, goal, COST_SLACK * abs(goal), check)
     else:
         found["expert"] = _expert(curve, base + EXPERT_SHARE * way, 0.02 * way, check)
     last = curve[-1][0] if isinstance(found["expert"], str) else found["expert"][0].step
     before = [point for point in curve if point[0] <= last]
-    if medium is None:
+    if (papers := medium_return(task)) is None:
         found["medium"] = _medium(before, base + MEDIUM_SHARE * way, MEDIUM_TOLERANCE * way, check)
     else:
-        found["medium"] = _medium(before, medium, PAPER_TOLERANCE * abs(medium), check)
-    if "mixed" in levels:
+        found["medium"] = _medium(before, papers, PAPER_TOLERANCE * abs(papers), check)
+    if not maze:
         found["mixed"] = found["medium"]
         if not isinstance(found["medium"], str):
             found["mixed"] = _mixed(before, found["medium"][0].step, check)
     picks = {level: picked for level, picked in found.items() if not isinstance(picked, str)}
     return Selection(task, base, convergence, picks, {level: why for level, why in found.items() if level not in picks})
-
-
-def _nothing(curve: Sequence[Point], base: float, convergence: Convergence) -> str:
-    """Why no level at all can be picked."""
-    if not curve:
-        return "the run has no evaluated checkpoint yet"
-    return convergence.reason or (
-        f"--converged {convergence.value:g} is not above where the return started ({base:.1f}); give the return of the "
-        "longer run"
-    )
 
 
 def _expert(curve: Sequence[Point], goal: float, slack: float, check: Callable) -> tuple[Pick, ...] | str:
@@ -292,7 +273,6 @@ def select_checkpoints(
     episodes: int = 100,
     seed: int = 20_000,
     deterministic: bool = True,
-    converged: float | None = None,
     progress: ProgressCallback = ignore,
 ) -> Selection:
     """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
@@ -301,7 +281,6 @@ def select_checkpoints(
     in `reasons`, and earlier picks of that level are left alone.
 
     Args:
-      converged: return at convergence, of a longer run, if this one ends before it; None: from the curve.
       progress: called with the name of each checkpoint that is evaluated on fresh episodes.
 
     Raises:
@@ -313,37 +292,22 @@ def select_checkpoints(
     if not curve:
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
     task = get_task(read_header(curve[0][2]).task)
-    mazes = is_maze(task.id)
-    _make_place(folder)
     base = _base(task, episodes, seed)
-    measured: dict[Path, tuple[Policy, Evaluation]] = {}
+    measured: dict[str, Policy] = {}
 
     def measure(path: Path) -> Evaluation:
-        if path not in measured:
-            expect(progress, max(len(measured) + 1, MAZE_CHECKPOINTS if mazes else 1 + CANDIDATES // 2 + MIXED_COUNT))
-            progress(f"step {int(path.stem):,}")
-            policy = load_policy(path, task)
-            measured[path] = policy, evaluate(policy, task, episodes, seed, deterministic, streams=FRESH)[0]
-        return measured[path][1]
+        expect(progress, max(len(measured) + 1, MEASURED))
+        progress(f"step {int(path.stem):,}")
+        policy = measured[str(path)] = load_policy(path, task)
+        return evaluate(policy, task, episodes, seed, deterministic, streams=FRESH)[0]
 
     end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
-    if converged is not None:
-        end = Convergence(converged, 0.0, True)
-    levels = MAZE_TRAINED_LEVELS if mazes else TRAINED_LEVELS
-    selection = pick_checkpoints(curve, base, end, measure, task.id, levels, medium_return(task.id), mazes)
+    selection = pick_checkpoints(task.id, curve, base, end, measure)
     expect(progress, len(measured))
     with storage_errors(folder, "write to"):
-        _write(folder, curve, selection, {str(path): policy for path, (policy, _) in measured.items()})
+        _write(folder, curve, selection, measured)
     plot_selection(curve, selection, folder / "curve.png")
     return selection
-
-
-def _make_place(folder: Path) -> None:
-    """Make the folder of the picks, and refuse one that cannot be written to before hours are spent on measuring."""
-    place = folder / "selected"
-    with storage_errors(place, "write to"):
-        place.mkdir(exist_ok=True)
-        tempfile.TemporaryFile(dir=place).close()
 
 
 def _base(task: Task, episodes: int, seed: int) -> float:
@@ -367,7 +331,6 @@ def selected_header(
     header: PolicyHeader, level: str, pick: Pick, convergence: Convergence, curve: Sequence[Point]
 ) -> PolicyHeader:
     """The header of a picked policy: also what it was picked for, and the whole learning curve of its run."""
-    header = header.without_local_paths()
     why = {"selection": {"target": pick.target, "convergence": round(convergence.value, 2)}}
     shown = {"curve": {"steps": [step for step, _, _ in curve], "returns": [round(value, 2) for _, value, _ in curve]}}
     facts = {"level": level, "evaluation": pick.evaluation, "training": header.training | why | shown}

@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
 
@@ -92,21 +91,13 @@ def check_settings(algorithm: str, values: Mapping[str, Any]) -> Any:
         ) from None
 
 
-def parse_settings(pairs: Sequence[str], config: str | Path | None, algorithm: str) -> dict[str, Any]:
-    """Settings from a YAML file and --set key=value pairs (which win), as plain JSON values.
+def parse_settings(pairs: Sequence[str], algorithm: str) -> dict[str, Any]:
+    """Settings from --set key=value pairs, as plain JSON values.
 
     Raises:
-      DmcvbError: not key=value, an unreadable file, an unknown setting (lists the known ones) or a wrong value.
+      DmcvbError: not key=value, an unknown setting (lists the known ones) or a wrong value.
     """
     settings: dict[str, Any] = {}
-    if config:
-        try:
-            read = read_yaml(Path(config))
-        except (OSError, ValueError) as error:
-            raise DmcvbError(f"cannot read settings from {config}: {error}") from None
-        if not isinstance(read or {}, dict):
-            raise DmcvbError(f"{config} holds no settings; write lines like `learning_rate: 0.0003`")
-        settings |= {str(name): value for name, value in (read or {}).items()}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals:

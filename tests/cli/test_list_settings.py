@@ -29,7 +29,7 @@ def test_every_setting_of_every_algorithm_has_a_meaning(algorithm, task):
 def test_values_are_the_tasks_and_those_given():
     walker = json.loads(ask("walker-walk", "--json").stdout)
     maze = json.loads(ask("ant-maze-empty7x7", "--json", "--set", "critics=3").stdout)
-    assert (walker["bins"]["value"], walker["simulations"]["value"]) == (101, 8)
+    assert (walker["learning_rate"]["value"], walker["simulations"]["value"]) == (0.001, 8)
     assert (maze["simulations"]["value"], maze["critics"]["value"]) == (16, 3)
     assert "simulations=16" in ask("ant-maze-empty7x7").stdout
 

@@ -30,7 +30,7 @@ TINY = {
 def test_a_suite_task_goes_the_whole_way(task_id, tmp_path):
     folder, task = tmp_path / "release", get_task(task_id)
     settings = [word for key, value in TINY.items() for word in ("--set", f"{key}={value}")]
-    run("train-behaviour", task_id, "--steps", 16, *settings, "--precision", "float32", "--out", tmp_path / "run")
+    run("train-behaviour", task_id, "--steps", 16, *settings, "--set", "bfloat16=false", "--out", tmp_path / "run")
     newest = max((tmp_path / "run" / "checkpoints").glob("[0-9]*.safetensors"))
     short = ["--level", "expert", "--behaviour", newest, "--episodes", 2, "--max-steps", 4, "--size", SIZE]
     run("rollout", task_id, *short, "--distractor", "dynamic", "--out", folder)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import subprocess
 import sys
 import tracemalloc
@@ -16,7 +15,6 @@ from safetensors.torch import load_file, save_file
 from dmcvb_gen import arithmetic
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.policies.actor import Policy, random_policy
-from dmcvb_gen.policies.archives import bundled_digests, bundled_file
 from dmcvb_gen.policies.bundled import bundled_policies, resolve_policies
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
@@ -179,7 +177,7 @@ def test_a_small_file_that_asks_for_huge_layers_is_refused_at_once(tmp_path):
     header = json.loads(header_of(hidden=[65_536] * 16).model_dump_json())
     save_file({"mean.bias": torch.zeros(6)}, path, metadata={"header": json.dumps(header)})
     tracemalloc.start()
-    with pytest.raises(PolicyFileError, match="asks for"):
+    with pytest.raises(PolicyFileError, match="ask for"):
         load_policy(path)
     assert tracemalloc.get_traced_memory()[1] < 2**20
     tracemalloc.stop()
@@ -223,37 +221,6 @@ def test_a_missing_level_says_how_to_get_it(tmp_path):
         bundled_policies("walker-walk", "grandmaster")
     with pytest.raises(PolicyFileError, match="select-checkpoints"):
         resolve_policies("walker-walk", "expert", tmp_path)
-
-
-@pytest.mark.parametrize(
-    "path, name",
-    [
-        ("/home/alice/my runs/stand", "stand"),
-        ("~/runs/stand/", "stand"),
-        ("../../alice/stand.safetensors", "stand.safetensors"),
-        ("C:\\Users\\alice\\stand", "stand"),
-        ("runs/stand", "runs/stand"),
-        (None, None),
-    ],
-)
-def test_a_placeless_header_has_the_last_names_of_paths_alone(path, name):
-    command = "dmcvb-gen train-behaviour x" + (f" --init-from {shlex.quote(path)}" if path else "")
-    settings = {"learning_rate": 0.1, "hidden": [8, 8], "compile": False}
-    header = header_of(
-        training={"init_from": path, "settings": settings, "seed": 0}, command=f"{command} --set 'a=\"b\"'"
-    )
-    bare = header.without_local_paths()
-    assert bare.training == {"init_from": name, "settings": settings, "seed": 0}
-    words = shlex.split(bare.command)
-    assert words[-2:] == ["--set", 'a="b"'] and (words[4] if path else None) == name
-    assert "alice" not in bare.model_dump_json() and (bare == header) == (path == name)
-    unreadable = header_of(command="x 'unclosed /home/alice/y").without_local_paths()
-    assert "alice" not in unreadable.command
-
-
-def test_no_bundled_policy_names_a_place():
-    files = [bundled_file(name) for name in bundled_digests()]
-    assert files and all(read_header(path).without_local_paths() == read_header(path) for path in files)
 
 
 @pytest.mark.parametrize("level, count", [("expert", 1), ("medium", 1), ("mixed", 8)])

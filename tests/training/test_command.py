@@ -32,7 +32,7 @@ def test_the_command_of_a_run_parses_back_to_its_configuration(init_from):
     given = context.params
     assert (given["task"], given["algo"], given["steps"], given["seed"]) == ("humanoid-walk", "sac", 1000, 3)
     assert (given["evaluate_every"], given["init_from"]) == (700, init_from)
-    assert parse_settings(given["settings"], None, "sac") == settings
+    assert parse_settings(given["settings"], "sac") == settings
 
 
 def simulation(lengths, terminated, distance):
@@ -139,3 +139,43 @@ def test_a_task_without_a_setting_of_its_own_goes_from_nothing_to_data(tmp_path,
     made = CliRunner().invoke(main, ["rollout", task, *behaviour, *out])
     assert made.exit_code == 0, made.output
     assert CliRunner().invoke(main, ["verify", str(tmp_path / "data")]).exit_code == 0
+
+
+POLICY = str(bundled_policies("walker-walk", "expert")[0])
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["walker-fly"], "walker-walk"),
+        (["walker-walk", "--algo", "dreamer"], "Known: guided, mpo, sac, sb3:PPO, sb3:SAC, sb3:TD3."),
+        (["walker-walk", "--set", "learning_rat=3"], "Did you mean 'learning_rate'?"),
+        (["walker-walk", "--algo", "sb3:PPO", "--set", "buffer_size=3"], "clip_range"),
+        (["walker-walk", "--algo", "sb3:PPPO"], "Did you mean 'PPO'?"),
+        (["walker-walk", "--set", "foo=1"], "more; --list-settings lists them all."),
+        (["walker-walk", "--set", "speed"], "key=value"),
+        (["walker-walk", "--set", "discount=1.5"], "setting discount of sac is 1.5: input should be less than 1"),
+        (["walker-walk", "--set", "actor_hidden=wide"], "the default is (256, 256)"),
+        (
+            ["walker-walk", "--algo", "sb3:DQN", "--steps", "80"],
+            "sb3:DQN does not accept this: The algorithm only supports",
+        ),
+        (["walker-walk", "--algo", "sb3:RecurrentPPO", "--steps", "80"], "does not accept this"),
+        (["walker-walk", "--algo", "sb3:CrossQ", "--steps", "80"], "which is no part of a plain MLP"),
+        (["walker-walk", "--algo", "sb3:SAC", "--init-from", POLICY], "--init-from has no effect"),
+        (
+            ["walker-walk", "--set", "critic_hidden=[]"],
+            "setting critic_hidden of sac is []: tuple should have",
+        ),
+        (["walker-walk", "--set", "actor_hidden=[100000]"], "less than or equal to 65536"),
+        (["ant-maze-easy7x7a", "--algo", "guided", "--set", "layers=17"], "setting layers of guided is 17"),
+        (["walker-walk", "--steps", "0"], "x>=1"),
+        (["walker-walk", "--steps", "100"], "all warm-up (5000 steps)"),
+        (["walker-walk", "--steps", "4000", "--init-from", POLICY], "or less warm-up: --set warmup_steps=N"),
+        (["walker-walk", "--set", "buffer_size=4000"], "4000 steps are all warm-up (5000 steps)"),
+    ],
+)
+def test_bad_commands_say_what_is_wrong(tmp_path, arguments, words):
+    result = CliRunner().invoke(main, ["train-behaviour", *arguments, "--out", str(tmp_path / "run")])
+    assert result.exit_code == 2 and words in result.output and not (tmp_path / "run").exists()
+    assert len(result.output.strip().splitlines()) == 1 or "Usage" in result.output

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
-import shutil
-
 import numpy as np
 import pytest
 import torch
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import Policy
-from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.open_maze import open_maze_observation, places
-from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
+from dmcvb_gen.policies.policy_file import load_policy, read_header
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
 from dmcvb_gen.tasks.ant_maze.waypoints import AHEAD, headings
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
 from dmcvb_gen.training import run as runs
-from dmcvb_gen.training.guided import EVALUATION_STEPS, Student, base_policy, draw_places
+from dmcvb_gen.training.guided import Student, base_policy, draw_places
 from dmcvb_gen.training.networks import WaypointNetwork, as_arrays
 from dmcvb_gen.training.run import RunConfig, open_run
 
@@ -28,18 +24,6 @@ def config(task="ant-maze-easy7x7a", steps=640, **changes):
     settings = dict(simulations=8, batch_size=64, updates_per_step=0.5) | changes.pop("settings", {})
     fields = dict(algorithm="guided", seed=0, evaluate_every=steps)
     return RunConfig(task=task, steps=steps, settings=settings, **fields | changes)
-
-
-def test_a_run_goes_on_when_its_guide_is_gone(tmp_path, monkeypatch):
-    guide = tmp_path / "guide.safetensors"
-    shutil.copy(bundled_policies("ant-maze-empty7x7", "expert")[0], guide)
-    monkeypatch.setattr(runs, "EVALUATION_STEPS", {"ant-maze": 0.5})
-    asked = config(steps=16, init_from=str(guide))
-    open_run(tmp_path / "run", asked, False).train()
-    guide.unlink()
-    run = open_run(tmp_path / "run", dataclasses.replace(asked, steps=32), True)
-    run.train()
-    assert run.step == 32 and base_policy(run).digest == run.header.training["walker"]
 
 
 def walked(task, steps=30, size=6):
@@ -81,7 +65,6 @@ def test_headed_is_what_an_ant_in_the_middle_of_an_open_maze_sees():
 
 def test_the_actor_and_the_network_that_learns_agree(tmp_path):
     run = open_run(tmp_path / "run", config(), False)
-    (tmp_path / "run" / "resume").mkdir(parents=True, exist_ok=True)
     base = base_policy(run)
     student = Student(run, base)
     policy = Policy(run.header, as_arrays(student.weights()), "")
@@ -137,44 +120,6 @@ def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
         with torch.no_grad():
             errors.append(float(((way(torch.from_numpy(place)) - told) ** 2).sum(1).mean()))
     assert errors[1] < 0.5 * errors[0]
-
-
-def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp_path, monkeypatch):
-    """Counted from outside: agent steps that evaluations were asked to simulate, for those that were trained."""
-    asked, known = [], load_policy(bundled_policies("ant-maze-easy7x7a", "expert")[0]).header.evaluation
-
-    def counted(policy, task, episodes=100, **given):
-        asked.append(episodes * task.max_steps)
-        return known, None
-
-    monkeypatch.setattr(runs, "evaluate", counted)
-    run = open_run(tmp_path / "run", config(steps=192, evaluate_every=64), False)
-    run.train()
-    assert asked == [4 * 600] * 3 and sum(asked) <= EVALUATION_STEPS * 192
-    run.step += 100_000
-    assert run.evaluation_episodes() == 60  # however long none was
-
-
-@pytest.mark.slow
-def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "EVALUATION_EPISODES", 1)
-    rare = dict(evaluate_every=10_000)
-    open_run(tmp_path / "run", config(steps=128, **rare), False).train()
-    open_run(tmp_path / "run", config(steps=256, **rare), True).train()
-    open_run(tmp_path / "whole", config(steps=256, **rare), False).train()
-    ends = [load_policy(tmp_path / name / "checkpoints/0000000256.safetensors").weights for name in ("run", "whole")]
-    assert all(np.array_equal(ends[0][name], value) for name, value in ends[1].items())
-
-
-@pytest.mark.slow
-def test_a_run_does_not_go_on_with_another_walker(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "EVALUATION_EPISODES", 2)
-    open_run(tmp_path / "run", config(steps=64, evaluate_every=10_000), False).train()
-    longer = open_run(tmp_path / "run", config(steps=128, evaluate_every=10_000), True)
-    other = load_policy(bundled_policies("ant-maze-empty7x7", "medium")[0])
-    save_policy(tmp_path / "run/resume/base_policy.safetensors", other.header, other.weights)
-    with pytest.raises(DmcvbError, match="another walking policy"):
-        longer.train()
 
 
 def test_what_cannot_be_guided(tmp_path):

@@ -7,17 +7,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 from torch.distributions import Independent, Normal, kl_divergence
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.header import PolicyHeader
-from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import mpo
 from dmcvb_gen.training.mpo import Mpo, Settings
-from dmcvb_gen.training.run import RunConfig, open_run
 from dmcvb_gen.training.settings import check_settings
 
 SMALL = dict(actor_hidden=[16], critic_hidden=[16], batch_size=32, warmup_steps=64, simulations=4, compile=False)
@@ -95,7 +90,7 @@ def test_the_policy_keeps_to_its_bounds_between_targets():
     with torch.no_grad():
         mpo_learner.duals[1:] = -20.0  # without multipliers it runs away
     for _ in range(100):
-        mpo_learner.dual_optimizer.param_groups[0]["lr"] = 0.0
+        mpo_learner.optimizers["dual"].param_groups[0]["lr"] = 0.0
         mpo_learner.update(batch_of())
     assert mpo_learner.metrics()["kl_mean"] > 1e-2
 
@@ -121,16 +116,10 @@ def test_from_a_policy_file_the_targets_draw_its_actions():
         assert all(torch.equal(value, weights[name]) for name, value in network.state_dict().items())
 
 
-def test_its_policies_roll_out(tmp_path):
-    config = RunConfig("walker-walk", "mpo", 128, 0, SMALL, evaluate_every=128)
-    run = open_run(tmp_path / "run", config, False)
-    run.train()
-    path = tmp_path / "run" / "checkpoints" / f"{run.step:010d}.safetensors"
-    policy = load_policy(path, get_task("walker-walk"))
-    assert policy.header.algorithm == "mpo" and "--algo mpo" in policy.header.command
-    words = ["rollout", "walker-walk", "--level", "expert", "--behaviour", str(path), "--episodes", "1"]
-    done = CliRunner().invoke(main, [*words, "--max-steps", "3", "--size", "16", "--out", str(tmp_path / "r")])
-    assert done.exit_code == 0, done.output
+def test_multipliers_of_any_size_begin_as_they_were_set():
+    starts = dict(initial_temperature=1e-3, initial_multiplier_mean=1.0, initial_multiplier_std=1000.0)
+    duals = learner(**starts).duals
+    np.testing.assert_allclose(torch.nn.functional.softplus(duals).detach().numpy(), list(starts.values()), rtol=1e-3)
 
 
 @pytest.mark.parametrize("given", [{"epsilon": 0.0}, {"action_samples": 0}, {"epsilon_meen": 0.1}])

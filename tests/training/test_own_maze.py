@@ -7,14 +7,12 @@ import re
 import shlex
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import dmcvb_gen
-from dmcvb_gen import progress
 from dmcvb_gen.cli import main
-from dmcvb_gen.training import behaviour, selection
+from dmcvb_gen.training import selection
 
 HALL = "****\n*  *\n****\n"
 SHORT = "--steps 448 --evaluate-every 64 --set ramp=200 --set simulations=16 --set width=64"
@@ -40,11 +38,8 @@ def documented_commands() -> list[list[str]]:
 def quick_selection(monkeypatch):
     """Convergence, medium to a tenth and 100 episodes a checkpoint take minutes; the commands' way is the same."""
     select = selection.select_checkpoints
-
-    def select_fast(folder, episodes, progress):
-        return select(folder, 5, converged=-80.0, progress=progress)
-
-    monkeypatch.setattr(selection, "select_checkpoints", select_fast)
+    monkeypatch.setattr(selection, "converge", lambda *curve: selection.Convergence(-80.0, 0.0, True))
+    monkeypatch.setattr(selection, "select_checkpoints", lambda folder, progress: select(folder, 5, progress=progress))
     monkeypatch.setattr(selection, "MEDIUM_TOLERANCE", 0.6)
 
 
@@ -61,34 +56,6 @@ def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, 
     release = dmcvb_gen.open(str(in_folder / "ring"))
     assert sorted(name.split("/")[1] for name in release) == ["expert", "medium"]
     assert [release[name].array("length").shape for name in release] == [(20,), (20,)]
-
-
-@pytest.mark.slow
-def test_one_bar_counts_training_evaluations_and_selection(in_folder, quick_selection, monkeypatch):
-    bars = []
-
-    class Recorded(progress.ProgressBar):
-        def __init__(self, shown, **options):
-            super().__init__(True, **options | {"file": open(os.devnull, "w")})
-            self.counted = []
-            bars.append(self)
-
-        def update(self, n=1):
-            self.counted.append(n)
-            return super().update(n)
-
-    monkeypatch.setattr(progress, "ProgressBar", Recorded)
-    (in_folder / "hall.txt").write_text(HALL)
-    settings = ["ramp=200", "simulations=16", "width=64"]
-    run = dmcvb_gen.train_behaviour(layout="hall.txt", steps=448, evaluate_every=64, settings=settings)
-    (bar,) = bars
-    episode, rows = 600, [int(step) for step in np.genfromtxt(run.folder / "progress.csv", delimiter=",")[1:, 0]]
-    measured = bar.counted.count(behaviour.SELECTION_EPISODES * episode)
-    evaluated = [n for n in bar.counted if n % episode == 0 and n < behaviour.SELECTION_EPISODES * episode]
-    paths = {pick.path for picks in run.selection.picks.values() for pick in picks}
-    assert paths and measured >= len(paths) and len(evaluated) == len(rows) == 7
-    assert sum(n for n in bar.counted if n % episode) == run.steps == 448
-    assert bar.n == bar.total == sum(bar.counted)
 
 
 @pytest.mark.parametrize(

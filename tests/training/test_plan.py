@@ -70,12 +70,10 @@ def test_a_pause_says_nothing_of_the_time_left(tmp_path, monkeypatch):
         for _ in range(4):
             tick(8)
 
-    run = SimpleNamespace(
-        config=SimpleNamespace(steps=32, task="walker-walk"), task=SimpleNamespace(max_steps=500), train=train
-    )
+    run = SimpleNamespace(config=SimpleNamespace(steps=32, task="walker-walk"), train=train)
     monkeypatch.setattr(progress, "ProgressBar", Recorded)
     monkeypatch.setattr(behaviour, "time", SimpleNamespace(monotonic=lambda: next(clock)))
-    behaviour._train(run, 0, False, True, lambda line: None)
+    behaviour._train(run, 0, True, lambda line: None)
     assert bars[0].resumed == [8] and bars[0].n == 32
 
 

@@ -20,19 +20,11 @@ from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import level_files
 from dmcvb_gen.policies.evaluation import FRESH, evaluate
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader
-from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import read_header, save_policy
-from dmcvb_gen.spec import MAZE_TRAINED_LEVELS as MAZE_LEVELS
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.training import selection
 from dmcvb_gen.training.networks import Actor, as_arrays
-from dmcvb_gen.training.selection import (
-    MIXED_COUNT,
-    Convergence,
-    converge,
-    pick_checkpoints,
-    read_curve,
-    select_checkpoints,
-)
+from dmcvb_gen.training.selection import MIXED_COUNT, converge, pick_checkpoints, read_curve, select_checkpoints
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -42,25 +34,18 @@ def rising(top=1000.0, at=40, base=0.0):
     return base + (top - base) * np.minimum(np.arange(1, 101) / at, 1)
 
 
-def points_of(returns):
-    return [(int(step), float(value), Path(str(i))) for i, (step, value) in enumerate(zip(STEPS, returns, strict=True))]
-
-
-def select(returns, base=0.0, noise=0.0, fresh=None):
+def select(returns, base=0.0, noise=0.0, fresh=None, task="", keep=lambda step: True):
     """Select from a synthetic curve; fresh episodes return the true value (or `fresh`)."""
-    rng = np.random.default_rng(0)
-    seen = returns + noise * rng.normal(size=len(returns))
-    curve = [
-        (int(step), float(value), Path(f"{index}"))
-        for index, (step, value) in enumerate(zip(STEPS, seen, strict=False))
-    ]
+    seen = returns + noise * np.random.default_rng(0).normal(size=len(returns))
+    curve = [(int(STEPS[index]), float(value), Path(f"{index}")) for index, value in enumerate(seen)]
     truth = returns if fresh is None else fresh
 
     def measure(path):
         value = float(truth[int(path.name)])
         return Evaluation(mean=value, std=abs(noise), episodes=100, mode="mean", seed=0)
 
-    return pick_checkpoints(curve, base, converge([p[0] for p in curve], seen, base), measure)
+    end = converge([point[0] for point in curve], seen, base)
+    return pick_checkpoints(task, [point for point in curve if keep(point[0])], base, end, measure)
 
 
 @pytest.mark.parametrize("step", [0, 20_000])
@@ -171,38 +156,24 @@ def test_a_jump_over_the_half_says_what_is_missing():
 
 
 def test_checkpoints_too_far_apart_for_mixed_say_which_is_missing():
-    returns = rising()
-    curve = points_of(returns)
-    sparse = [point for point in curve if not 4000 < point[0] < 15_000]
-
-    def measure(path):
-        return Evaluation(mean=float(returns[int(path.name)]), std=0, episodes=100, mode="mean", seed=0)
-
-    found = pick_checkpoints(sparse, 0.0, converge(STEPS, returns), measure)
+    found = select(rising(), keep=lambda step: not 4000 < step < 15_000)
     assert "near step 5714 (number 3 of 8)" in found.reasons["mixed"] and "medium" in found.picks
 
 
-def test_a_maze_medium_is_nearest_to_the_papers_row():
+def test_a_maze_medium_is_nearest_to_the_papers_row_and_there_is_no_mixed():
     returns = rising(top=-50.0, base=-450.0)
-    curve = points_of(returns)
-
-    def measure(path):
-        return Evaluation(mean=float(returns[int(path.name)]), std=0, episodes=100, mode="mean", seed=0)
-
-    picked = {}
-    for task_id in ("ant-maze-empty7x7", "ant-maze-easy7x7b", "ant-maze-medium7x7c"):
-        goal = medium_return(task_id)
-        end = converge(STEPS, returns, -450.0)
-        found = pick_checkpoints(curve, -450.0, end, measure, levels=MAZE_LEVELS, medium=goal, costs=True)
+    for task, goal in (
+        ("ant-maze-empty7x7", -172.2),
+        ("ant-maze-easy7x7b", -131.1),
+        ("ant-maze-medium7x7c", -176.0),
+        ("ant-maze-medium:***/*.*/***", -250),  # the user's own, and another reward, have no row: half of the way
+        ("ant-maze-empty7x7@geodesic", -250),
+    ):
+        found = select(returns, base=-450.0, task=task)
+        assert set(found.picks) == {"expert", "medium"} and not found.reasons
         assert found.picks["medium"][0].evaluation.mean == pytest.approx(goal, abs=10)
         assert -50 / 0.95 <= found.picks["expert"][0].evaluation.mean <= -50  # 95 % of the way would be -70
-        picked[task_id] = goal
-    assert picked == {"ant-maze-empty7x7": -172.2, "ant-maze-easy7x7b": -131.1, "ant-maze-medium7x7c": -176.0}
-    assert medium_return("walker-walk") is None and medium_return("ant-maze-mine:***/*.*/***") is None
-    for other in ("ant-maze-medium:***/*.*/***", "ant-maze-empty7x7@geodesic"):  # the user's own, and another reward
-        assert medium_return(other) is None
-    high = [point for point in curve if point[1] > -120]
-    found = pick_checkpoints(high, -450.0, converge(STEPS, returns), measure, levels=MAZE_LEVELS, medium=-176.0)
+    found = select(returns, base=-450.0, task="ant-maze-medium7x7a", keep=lambda step: step > 33_000)
     assert "-176.0 +- 35.2" in found.reasons["medium"]
 
 
@@ -249,51 +220,16 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
             }
 
 
-@pytest.mark.slow
-def test_a_short_run_may_be_told_where_a_longer_one_ends(run_folder):
-    found = select_checkpoints(run_folder, episodes=2, converged=10.0)
-    assert found.convergence.value == 10.0 and "9.5" in found.reasons["expert"]
-
-
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(DmcvbError, match="give a run folder"):
         select_checkpoints(tmp_path)
 
 
-def test_mazes_have_no_mixed_level():
-    curve = [
-        (int(s), float(v), Path(str(i))) for i, (s, v) in enumerate(zip(STEPS, rising(-50, 40, -450), strict=True))
-    ]
-
-    def measure(path):
-        return Evaluation(mean=curve[int(path.name)][1], std=0, episodes=100, mode="mean", seed=0)
-
-    convergence = converge([p[0] for p in curve], [p[1] for p in curve], -450)
-    found = pick_checkpoints(curve, -450, convergence, measure, levels=MAZE_LEVELS, costs=True)
-    assert set(found.picks) == {"expert", "medium"} and not found.reasons
-    # A maze of one's own has no row in the paper: its expert is a maze's all the same, its medium at half of the way.
-    assert found.picks["expert"][0].target == f"return {convergence.value / 0.95:.1f}"
-    assert found.picks["medium"][0].target == f"return {(convergence.value - 450) / 2:.1f}"
-
-
-def test_a_folder_that_cannot_be_written_to_is_told_before_anything_is_measured(run_folder):
-    (run_folder / "selected").write_text("in the way")
-    measured = []
-    with pytest.raises(StoreError, match=r"cannot write to .*selected: .*; choose a place that you may write to"):
-        select_checkpoints(run_folder, episodes=2, progress=measured.append)
-    assert measured == []
-    (run_folder / "selected").unlink()
-    (run_folder / "curve.png").mkdir()  # what comes up at the end is one line, too
+def test_a_folder_that_cannot_be_written_to_is_one_line(run_folder, monkeypatch):
+    monkeypatch.setattr(selection, "MEDIUM_SHARE", 2.0)  # no medium, so little is measured
+    (run_folder / "curve.png").mkdir()
     with pytest.raises(StoreError, match=r"cannot write to .*curve\.png: "):
-        select_checkpoints(run_folder, episodes=2, converged=-1.0)  # nothing is above that, so nothing is measured
-
-
-def test_a_run_without_checkpoints_is_told_from_a_return_that_is_too_low(run_folder):
-    found = select_checkpoints(run_folder, episodes=2, converged=-1.0)
-    assert not found.picks
-    assert "--converged -1 is not above where the return started (0.0)" in found.reasons["expert"]
-    none = pick_checkpoints([], 0.0, Convergence(6.0, 0.1, True), pytest.fail)
-    assert "no evaluated checkpoint yet" in none.reasons["expert"]
+        select_checkpoints(run_folder, episodes=2)
 
 
 COSTS = """
