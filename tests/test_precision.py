@@ -51,7 +51,7 @@ def test_a_run_says_and_records_what_auto_chose(tmp_path, monkeypatch, fast):
     monkeypatch.setattr(precision, "choose_precision", lambda *arguments: fast)
     run = CliRunner().invoke(main, ["train-behaviour", "walker-walk", "--out", str(tmp_path / "run"), *SHORT])
     assert run.exit_code == 0, run.output
-    assert f", in {fast}." in run.stderr
+    assert f", {fast}: " in run.stderr
     assert read_config(tmp_path / "run").settings["bfloat16"] == (fast == "bfloat16")
 
 

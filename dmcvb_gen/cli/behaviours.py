@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import shutil
+import textwrap
 from pathlib import Path
 
 import click
@@ -47,13 +48,13 @@ def train_behaviour(as_json, list_settings, **options):
     try:
         run = train(notify=functools.partial(click.echo, err=True), **options)
     except Stopped as stopped:
-        click.echo(stopped, err=True)
+        click.echo(str(stopped).replace("; ", "\n"), err=True)  # commands to copy, each on a line
         click.get_current_context().exit(INTERRUPTED)
     picked = run.selection
     if as_json:
         facts = dict(out=str(run.folder), steps=run.steps, seconds=round(run.seconds, 1), curve=str(run.curve))
         return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
-    click.echo(f"{run.folder}: trained to {run.steps:,} agent steps; its curve is {run.curve}.")
+    click.echo(f"Trained to {run.steps:,} agent steps: {run.curve}")
     if not picked:
         return click.echo(f"Next: {_leave(options['task'])}dmcvb-gen select-checkpoints {quoted(run.folder)}")
     _show_picks(picked, run.folder)
@@ -124,7 +125,7 @@ def select_checkpoints(run, episodes, seed, sample, as_json):
 def _show_picks(picked, run):
     from dmcvb_gen.spec import task_folder
 
-    click.echo(f"{task_folder(picked.task)}: return at convergence {picked.convergence.standing}")
+    _tell(f"{task_folder(picked.task)}: return at convergence {picked.convergence.standing}")
     picks = [pick for level in picked.picks.values() for pick in level]
     if picks:
         print_table(
@@ -135,9 +136,13 @@ def _show_picks(picked, run):
             ],
         )
     for level, reason in picked.reasons.items():
-        click.echo(f"{level} cannot be picked yet: {reason}")
-    written = [f"{run}/selection.json", f"{run}/curve.png"]
-    click.echo(f"wrote {', '.join([f'{run}/selected'] * bool(picks) + written)}")
+        _tell(f"{level} cannot be picked yet: {reason}")
+    click.echo(f"Wrote {'selected/, ' * bool(picks)}selection.json and curve.png into {run}.")
+
+
+def _tell(sentence):
+    """Print a sentence in lines that fit the terminal."""
+    click.echo(textwrap.fill(sentence, shutil.get_terminal_size().columns, subsequent_indent="  "))
 
 
 @click.command("convert-policy")

@@ -2,9 +2,10 @@
 
 import contextlib
 import dataclasses
+import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ PROBE_SECONDS = 2.0
 """How long a run is tried to say how long it will take."""
 PROBED_STEPS = 10_000
 """Shorter runs are not: they are over soon."""
+BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 PAUSE = 10.0
 """Seconds without a step, as while updates are compiled, that say nothing of the time left."""
 
@@ -181,29 +183,28 @@ def plan_of(run: "Run", done: int = 0) -> list[str]:
 
     config, settings = run.config, run.settings
     random = 0 if config.init_from else getattr(settings, "warmup_steps", getattr(settings, "learning_starts", 0))
-    steps = f"{config.steps:,} agent steps" + (f", {done:,} of which are done" if done else "")
-    chance = f", the first {random:,} with random actions" if random > done else ""
-    precision = ""
+    how = [task_folder(config.task), config.algorithm]
     if hasattr(settings, "bfloat16"):
-        precision = f", in {'bfloat16' if settings.bfloat16 else 'float32'}"
-    lines = [f"{task_folder(config.task)} with {config.algorithm}: {steps}{chance}{precision}."]
+        how.append("bfloat16" if settings.bfloat16 else "float32")
+    steps = [f"{config.steps:,} agent steps"]
+    if random > done:
+        steps.append(f"{random:,} of them random")
+    if done:
+        steps.append(f"{done:,} of them done")
+    lines = [f"{', '.join(how)}: {', '.join(steps)}."]
     if config.steps - done >= PROBED_STEPS:
-        lines.append(
-            f"About {_minutes(probe(run) * (config.steps - done))} of one core at the pace of a two-second try, in "
-            "which nothing was compiled and evaluated."
-        )
+        time_left = _minutes(probe(run) * (config.steps - done))
+        lines.append(f"About {time_left} of one core, without evaluations (from a two-second try).")
     if bundled_names(config.task, "expert"):
         known = read_header(bundled_policies(config.task, "expert")[0])
         if known.evaluation:
-            lines.append(
-                f"To expect: {known.evaluation.mean:.0f}, as the package's own expert has after {known.agent_step:,} "
-                "agent steps."
-            )
+            after = f"after {known.agent_step:,} agent steps"
+            lines.append(f"To expect: {known.evaluation.mean:.0f}, as the package's own expert has {after}.")
     return lines
 
 
 def _minutes(seconds: float) -> str:
-    return f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
+    return f"{math.ceil(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class _Enough(Exception):
@@ -234,13 +235,13 @@ def probe(run: "Run") -> float:
 
 
 def _train(run: "Run", done: int, progress: bool, notify: Callable[[str], None]) -> None:
-    """Train a run under a bar."""
+    """Train a run under a bar of 80 columns, which shows the last evaluation beside the paper's expert."""
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.progress import ProgressBar
 
     name, expert = task_folder(run.config.task), paper_returns(run.config.task, "expert")
-    work: dict[str, float] = dict(total=run.config.steps, initial=done, smoothing=0)
-    with ProgressBar(progress, **work, unit=" steps", unit_scale=True, desc=name) as bar:
+    work: dict[str, Any] = dict(total=run.config.steps, initial=done, smoothing=0, unit=" steps", unit_scale=True)
+    with ProgressBar(progress, **work, desc=name, bar_format=BAR) as bar:
         last = time.monotonic()
 
         def tick(steps: int) -> None:
@@ -252,15 +253,7 @@ def _train(run: "Run", done: int, progress: bool, notify: Callable[[str], None])
             last = now
 
         def report(progress: Any) -> None:
-            bar.set_postfix_str(_standing(progress, expert), refresh=False)
+            beside = f"/{expert['mean']:.0f}" if expert else ""
+            bar.set_postfix_str(f"return {progress.evaluation.mean:.0f}{beside}", refresh=False)
 
         run.train(report, tick, lambda: notify("\nStopping: the run is being saved."))
-
-
-def _standing(progress: Any, expert: Mapping[str, float] | None) -> str:
-    """The last evaluation beside the paper's expert, and the pace."""
-    mean, pace = progress.evaluation.mean, f"{progress.updates_per_second:.0f} updates/s"
-    if not expert:
-        return f"return {mean:.1f}, {pace}"
-    share = f" ({100 * mean / expert['mean']:.0f} %)" if expert["mean"] > 0 else ""  # mazes' returns are costs
-    return f"return {mean:.1f} of the paper's {expert['mean']:.0f}{share}, {pace}"

@@ -91,12 +91,11 @@ class RunConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """One evaluation along the way; seconds are of training, evaluations left out."""
+    """One evaluation along the way, and the seconds of training until then, evaluations left out."""
 
     step: int
     evaluation: Evaluation
     seconds: float
-    updates_per_second: float
 
 
 class Stopped(DmcvbError):
@@ -287,7 +286,7 @@ class Run:
         evaluation, _ = evaluate(policy, self.task, self.evaluation_episodes(), seed=self.step)
         self._write_checkpoint(policy, evaluation)
         self._log.add(self.step, evaluation, self.seconds, updates, metrics)
-        self._report(Progress(self.step, evaluation, self.seconds, updates / max(self.seconds, 1e-9)))
+        self._report(Progress(self.step, evaluation, self.seconds))
         self._began = time.time()
 
     def evaluation_episodes(self) -> int:

@@ -80,9 +80,9 @@ class Convergence:
     @property
     def standing(self) -> str:
         """How sure it is, in words."""
-        state = "converged" if self.converged else "not converged"
         error = "" if math.isnan(self.error) else f" +- {self.error:.1f}"
-        return f"{self.value:.1f}{error}, {state}" + (f" ({self.reason})" if self.reason else "")
+        sure = "converged" if self.converged else "not converged"
+        return f"{self.value:.1f}{error} ({sure}{self.reason and ': '}{self.reason})"
 
 
 @dataclass(frozen=True)

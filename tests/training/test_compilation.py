@@ -15,7 +15,8 @@ from dmcvb_gen import compilation
 from dmcvb_gen.compilation import compiled, compiler
 
 LINE = "Training runs without torch.compile, which is slower"
-SMALL = {"warmup_steps": 8, "simulations": 4, "batch_size": 8, "actor_hidden": [8], "critic_hidden": [8]}
+SETTINGS = ("warmup_steps=8", "simulations=4", "batch_size=8", "actor_hidden=[8]", "critic_hidden=[8]")
+SMALL = [f"--set={pair}" for pair in SETTINGS]
 
 
 @pytest.fixture(autouse=True)
@@ -61,31 +62,14 @@ def test_a_functions_own_errors_are_not_hidden(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["sac", "mpo"])
-def test_a_training_without_a_compiler_says_so_in_one_line_and_trains(algorithm, tmp_path):
-    settings = [word for key, value in SMALL.items() for word in ("--set", f"{key}={value}")]
-    command = [
-        sys.executable,
-        "-m",
-        "dmcvb_gen",
-        "train-behaviour",
-        "walker-walk",
-        "--algo",
-        algorithm,
-        "--steps",
-        "32",
-    ]
-    environment = os.environ | {"CXX": "no-such-compiler"}
-    arguments = [*command, *settings, "--set", "compile=true", "--out", str(tmp_path / "run")]
-    done = subprocess.run(arguments, capture_output=True, text=True, env=environment)
+@pytest.mark.parametrize("command", ["sac", "mpo", "validate"])
+def test_what_trains_without_a_compiler_says_so_in_one_line_and_trains(command, small_release, tmp_path):
+    if command == "validate":
+        words = ["validate", small_release, "--compile", "--agents", "state-bc", "--only", "*/*/none", "--workers", 1]
+    else:
+        words = ["train-behaviour", "walker-walk", "--algo", command, "--steps", 32, *SMALL, "--set", "compile=true"]
+    arguments = [sys.executable, "-m", "dmcvb_gen", *map(str, words), "--out", str(tmp_path / "out")]
+    done = subprocess.run(arguments, capture_output=True, text=True, env=os.environ | {"CXX": "no-such-compiler"})
     assert done.returncode == 0, done.stderr
     assert done.stderr.count(LINE) == 1 and "Traceback" not in done.stderr
-    assert list((tmp_path / "run" / "checkpoints").glob("*.safetensors"))
-
-
-@pytest.mark.slow
-def test_a_validation_without_a_compiler_does_so_too(small_release, tmp_path):
-    command = [sys.executable, "-m", "dmcvb_gen", "validate", str(small_release), "--compile", "--agents", "state-bc"]
-    command += ["--only", "*/*/none", "--workers", "1", "--out", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"CXX": "no-such-compiler"})
-    assert done.returncode == 0 and done.stderr.count(LINE) == 1, done.stderr
+    assert command == "validate" or list((tmp_path / "out" / "checkpoints").glob("*.safetensors"))

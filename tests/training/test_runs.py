@@ -158,23 +158,9 @@ def test_what_is_learned_does_not_depend_on_how_often_it_is_evaluated(tmp_path):
     assert all(np.array_equal(value, other.weights[key]) for key, value in one.weights.items())
 
 
-def _train_in_a_process(folder, fields, signals=()):
-    """Train in a forked process, saving whenever it may, and send it signals: (seconds to wait, number)."""
-    process = multiprocessing.get_context("fork").Process(target=_train_saving_often, args=(folder, fields))
-    process.start()
-    for wait, number in signals:
-        process.join(wait)
-        if process.is_alive():
-            os.kill(process.pid, number)
-    process.join(120)
-    assert not process.is_alive()
-    return process.exitcode
-
-
 def _train_saving_often(folder, fields):
     runs.SAVE_SECONDS = 0
     train(folder, True, **fields)
-    os._exit(0)
 
 
 @pytest.mark.slow
@@ -183,8 +169,13 @@ def test_ten_kills_at_random_moments_change_nothing(tmp_path, case, steps, every
     fields = dict(case=case, steps=steps, every=every)
     whole, chance, kills = train(tmp_path / "whole", **fields), np.random.default_rng(0), 0
     for _ in range(10):
-        code = _train_in_a_process(tmp_path / "killed", fields, [(chance.uniform(0.05, 0.6), signal.SIGKILL)])
-        kills += code == -signal.SIGKILL
+        arguments = (tmp_path / "killed", fields)
+        process = multiprocessing.get_context("fork").Process(target=_train_saving_often, args=arguments)
+        process.start()
+        process.join(chance.uniform(0.05, 0.6))
+        process.kill()
+        process.join()
+        kills += process.exitcode == -signal.SIGKILL
     assert kills >= 2
     with (tmp_path / "killed" / "progress.csv").open("a") as file:
         file.write("99")  # a line half written
