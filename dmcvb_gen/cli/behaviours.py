@@ -60,7 +60,7 @@ def train_behaviour(as_json, list_settings, **options):
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
         maze = options["layout"] or picked.task
-        options = f"{quoted(maze)} --level expert --behaviour {quoted(run.folder)} --goal visible"
+        options = f"{quoted(maze)} --level expert --behaviour {quoted(run.folder)}"
         click.echo(f"Next: dmcvb-gen rollout {options}")
 
 

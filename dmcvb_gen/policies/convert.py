@@ -177,8 +177,8 @@ def convert(
             training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
         )
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise PolicyFileError(f"{path}: {first['loc'][0]}: {first['msg']}; give a smaller MLP") from None
+        problem = error.errors()[0]
+        raise PolicyFileError(f"{path}: {problem['loc'][0]}: {problem['msg']}; give a smaller MLP") from None
     check_weights(path, header, weights)
     if facts:
         _compare(path, header, weights, facts, state)

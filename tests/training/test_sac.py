@@ -201,11 +201,11 @@ def test_steps_that_follow_are_summed_as_far_as_an_episode_goes_on(data):
 def test_an_annealed_policy_is_paid_less_for_its_entropy():
     entropies, temperatures = [], []
     for anneal_after in (0, 10):
-        settings = dict(target_entropy_scale=-0.5, final_entropy_scale=4.0, learning_rate=3e-3)
+        settings = dict(target_entropy_scale=-1.0, final_entropy_scale=4.0, learning_rate=3e-3)
         sac, batch = learner(anneal_after=anneal_after, **settings), batch_of()
         for step in range(600):
             sac.schedule(step)
-            assert sac.target_entropy == (-8.0 if anneal_after and step >= anneal_after else 1.0)  # two actions
+            assert sac.target_entropy == (-8.0 if anneal_after and step >= anneal_after else 2.0)  # two actions
             sac.update(batch)
         entropies.append(sac.metrics()["entropy"])
         temperatures.append(sac.metrics()["temperature"])
