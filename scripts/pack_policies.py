@@ -21,7 +21,7 @@ from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze
 
 PAGE = Path(__file__).parents[1] / "docs/policies.md"
 TABLE = re.compile(r"(?<=<!-- scripts/pack_policies.py -->\n).*?(?=<!-- end -->)", re.DOTALL)
-HEAD = "| task | level | return | the paper's | TD-MPC2, SAC | agent step |\n|---|---|---|---|---|---|\n"
+HEAD = "| task | level | return | the paper's | TD-MPC2, SAC | agent step | minutes |\n|---|---|---|---|---|---|---|\n"
 OTHERS = {
     "ball_in_cup-catch": (986, 978),
     "cartpole-swingup": (876, 839),
@@ -58,7 +58,8 @@ def row(task: str, level: str) -> str:
     paper, others = paper_returns(task, level), OTHERS.get(task, ()) if level == "expert" else ()
     cells = [task, level, f"{np.mean(means):.0f} ± {spread:.0f}"]
     cells += [f"{paper['mean']:.0f} ± {paper['std']:.0f}" if paper else "", ", ".join(map(str, others))]
-    return "| " + " | ".join([*cells, f"{headers[-1].agent_step:,}"]) + " |\n"
+    cells += [f"{headers[-1].agent_step:,}", f"{headers[-1].training['seconds'] / 60:.1f}"]
+    return "| " + " | ".join(cells) + " |\n"
 
 
 def main() -> None:

@@ -68,7 +68,7 @@ def test_a_resumed_run_has_networks_normalization_and_buffer(tmp_path, models, a
     np.testing.assert_array_equal(model.get_env().obs_rms.mean, before.get_env().obs_rms.mean)
     if algorithm == "sb3:SAC":
         np.testing.assert_array_equal(model.replay_buffer.actions, before.replay_buffer.actions)
-        assert (model.replay_buffer.pos, float(model.log_ent_coef)) == (29, float(before.log_ent_coef))  # the last step's is left out
+        assert (model.replay_buffer.pos, float(model.log_ent_coef)) == (29, float(before.log_ent_coef))
 
 
 def test_it_starts_from_nothing_else(tmp_path):
