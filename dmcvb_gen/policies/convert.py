@@ -161,6 +161,7 @@ def convert(
         )
     weights |= _normalization(statistics, task.behaviour_size)
     normalizes = bool(weights["observation_mean"].any() or (weights["observation_std"] != 1).any())
+    network: dict[str, Any] = {"hidden": widths, "activation": activation, "distribution": distribution}
     try:
         header = PolicyHeader(
             task=task_id,
@@ -170,9 +171,7 @@ def convert(
             algorithm=layout.algorithm,
             agent_step=facts.steps if facts else 0,
             level=level,
-            hidden=widths,
-            activation=activation,
-            distribution=distribution,
+            **network,
             clip_observation=10.0 if normalizes else UNCLIPPED,
             training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
         )
