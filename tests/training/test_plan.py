@@ -43,8 +43,8 @@ def test_a_run_says_what_it_will_do(tmp_path, monkeypatch, algorithm, first):
 
 def test_short_runs_are_not_tried_and_what_is_done_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(behaviour, "probe", lambda run: pytest.fail("tried"))
-    said = lines_of(tmp_path, "cartpole-swingup", steps=9_000, done=6_000)
-    assert said == ["cartpole-swingup, sac, float32: 9,000 agent steps, 6,000 of them done."]
+    said = lines_of(tmp_path, "acrobot-swingup", steps=9_000, done=6_000)
+    assert said == ["acrobot-swingup, sac, float32: 9,000 agent steps, 6,000 of them done."]
 
 
 def test_a_pause_says_nothing_of_the_time_left(tmp_path, monkeypatch):
