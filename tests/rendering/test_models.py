@@ -10,16 +10,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import DistractorSetting, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RenderingError
 from dmcvb_gen.generate import renderer_choice as choice
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.rendering import make_renderer, opengl
-from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
-from tests.rendering.test_rendering import frames_of, needs_opengl
+from tests.rendering.test_rendering import drawn_labels, frames_of, needs_opengl
 
 SKY = '<texture type="skybox" builtin="gradient" rgb1=".4 .6 .8" rgb2="0 0 0" width="128" height="128"/>'
 CHECKER = 'builtin="checker" rgb1=".2 .3 .8" rgb2=".9 .9 .2" width="64"'
@@ -128,7 +127,7 @@ def task_of(tmp_path, xml, steps=8, **options):
 
 
 def labels_of(task, physics):
-    return sample_distractors(task, DistractorSetting(), physics[None], {"style": [None]}).flat()
+    return drawn_labels(task, DistractorSetting(), physics[None])
 
 
 def drawn(name, task, physics, labels):
@@ -228,22 +227,16 @@ def test_without_opengl_one_line_says_that_nobody_compared(tmp_path, monkeypatch
         make_renderer("opengl", task, 64)
 
 
-def labels_in(task, physics, setting):
-    streams = {name: [episode_stream(1, ("render",), 0, name)] for name in STREAMS}
-    return sample_distractors(task, DistractorSetting.parse(setting), physics[None], streams, load_backgrounds()).flat()
-
-
 @needs_opengl
 def test_a_video_needs_a_sky(tmp_path):
     task, physics = task_of(tmp_path, model(sky=""))
     with pytest.raises(RenderingError, match="has no sky to show a video on; add a texture"):
-        make_renderer("opengl", task, 64, backgrounds=load_backgrounds()).render(
-            physics[:1], labels_in(task, physics[:1], "dynamic")
-        )
+        labels = drawn_labels(task, DistractorSetting("dynamic"), physics[None])
+        make_renderer("opengl", task, 64, backgrounds=load_backgrounds()).render(physics, labels)
 
 
 @pytest.mark.parametrize("difficulty", ["color0.2", "camera0.2-cue0.9", "color0.2-cue0.9"])
 def test_a_model_without_materials_cannot_vary_its_colors(tmp_path, difficulty):
     task, physics = task_of(tmp_path, model(geom=None))
     with pytest.raises(DmcvbError, match="has no materials, so its colors cannot vary"):
-        labels_in(task, physics, f"dynamic_{difficulty}")
+        drawn_labels(task, DistractorSetting("dynamic", difficulty), physics[None])

@@ -61,6 +61,16 @@ def test_every_view_is_as_close_to_opengl_as_eyes_see(task_id, setting_name):
         assert worst < 2 * LARGEST_DIFFERENCE[task_id], name  # no frame lacks a shadow or a mirror image
 
 
+@pytest.mark.slow
+@needs_opengl
+@pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "finger-spin"])
+def test_moved_lamps_are_as_close(task_id):
+    """Finger's lamp is directional, the others are spots."""
+    _, reference, ours = pair(task_id, "dynamic_light0.5")
+    assert np.abs(reference - ours).mean() < 1.5
+    assert np.abs(ours - pair(task_id, "none")[2]).mean() > 2
+
+
 @needs_opengl
 def test_larger_pictures_are_as_close():
     _, reference, ours = pair("walker-walk", "dynamic", 200)

@@ -10,11 +10,17 @@ from dmcvb_gen.errors import RenderingError, UnknownNameError
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.opengl import unavailable
-from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 
 needs_opengl = pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
 FRAMES = 12
+
+
+def drawn_labels(task, setting, physics):
+    """Labels of (episode, frame, physics) states, one after another."""
+    streams = {name: [episode_stream(1, ("render",), i, name) for i in range(len(physics))] for name in STREAMS}
+    return sample_distractors(task, setting, physics, streams, load_backgrounds()).flat()
 
 
 def frames_of(task_id, setting_name, count=FRAMES):
@@ -27,12 +33,7 @@ def frames_of(task_id, setting_name, count=FRAMES):
             batch.step(rng.uniform(-1, 1, (2, task.action_size)))
         rows.append(batch.physics())
     physics = np.stack(rows, axis=1)
-    generators = {
-        name: [episode_stream(1, ("render",), i, name) for i in range(2)]
-        for name in ("camera", "color", "background", "style")
-    }
-    labels = sample_distractors(task, setting, physics, generators, load_backgrounds()).flat()
-    return task, setting, physics.reshape(-1, physics.shape[-1]), labels
+    return task, setting, physics.reshape(-1, physics.shape[-1]), drawn_labels(task, setting, physics)
 
 
 def renderer_of(name, task, setting, size=64, **options):
@@ -42,7 +43,7 @@ def renderer_of(name, task, setting, size=64, **options):
 
 
 class RendererTests:
-    """What every renderer does. A renderer of your own passes it too: inherit, and set `name`."""
+    """What every renderer does."""
 
     name: str
 
