@@ -104,8 +104,8 @@ def task_of(case):
     return EnvironmentTask("t", functools.partial(make, case))
 
 
-def rolled(task, episodes):
-    return simulate(task, [random_policy(task)], episodes, SEED, NAMES)
+def rolled(task, episodes, max_steps=None):
+    return simulate(task, [random_policy(task)], episodes, SEED, NAMES, max_steps=max_steps)
 
 
 def numbers(model):
@@ -152,7 +152,8 @@ def check_episode(task, made, place, environment):
             if last:
                 break
         assert made.reward[place, row] == np.float32(reward) and made.discount[place, row] == np.float32(discount)
-    assert last and made.terminated[place] == (step.discount == 0)
+    assert last or length == made.action.shape[1] - 1 < task.max_steps
+    assert made.terminated[place] == (step.discount == 0)
 
 
 @named(EQUAL)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import shutil
 import sys
 
@@ -21,9 +20,10 @@ from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.own_code import TASKS as ALLOWED
 from dmcvb_gen.own_code import allow
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.tasks import ACTION_REPEAT, LOCOMOTION_TASKS, PHYSICS_SPEC, get_task, suite_ids
+from dmcvb_gen.tasks import LOCOMOTION_TASKS, PHYSICS_SPEC, get_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
 from tests.conftest import rewrite, roll_out
+from tests.tasks.test_own_tasks import check_episode, rolled
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
 """Largest difference of an observation; physics states are always equal. Humanoid's limb positions are one matrix
@@ -39,8 +39,6 @@ SUITE = (
     "quadruped-escape",
 )  # fmt: skip
 """Tasks of dm_control's suite: all domains but humanoid_CMU and stacker, whose physics costs more than it shows."""
-
-CHANGING = ("geom_pos", "geom_size", "geom_rgba", "site_pos", "body_pos", "dof_damping", "mat_rgba", "hfield_data")
 
 
 def dm_control_observation(task_id, observation):
@@ -103,39 +101,14 @@ def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):
         if name not in LOCOMOTION_TASKS
     ],
 )
-def test_a_task_of_the_suite_is_dm_controls_step_by_step(task_id):
-    task, (domain, name) = get_task(task_id), task_id.split("-", 1)
-    batch, rng = task.batch(SIMULATIONS), np.random.default_rng(7)
-    for episode in range(2):  # the second one in the same environments
-        seeds = [10 * episode + sim for sim in range(SIMULATIONS)]
-        state = batch.reset([np.random.default_rng(seed) for seed in seeds])
-        drawn = [np.random.MT19937(int(np.random.default_rng(seed).integers(2**63))) for seed in seeds]
-        environments = [suite.load(domain, name, {"random": 0}) for _ in drawn]  # from which lqr draws its model
-        for environment, bits in zip(environments, drawn, strict=True):
-            environment.physics._make_rendering_contexts = lambda: None  # terrain would be put on a graphics card
-            environment.task.random.set_state(np.random.RandomState(bits).get_state())
-        steps, reward = [environment.reset() for environment in environments], np.zeros(SIMULATIONS)
-        for _ in range(8):
-            for sim, environment in enumerate(environments):
-                theirs = steps[sim].observation
-                assert {key: np.size(part) for key, part in theirs.items()} == task.state_fields
-                np.testing.assert_array_equal(state[sim], np.concatenate([np.ravel(part) for part in theirs.values()]))
-                row, model = batch.physics()[sim], copy.deepcopy(task.model)
-                full = environment.physics.get_state(mujoco.mjtState.mjSTATE_INTEGRATION)
-                np.testing.assert_array_equal(row[: len(full)], full)
-                task.apply_entries(model, row)
-                for field in CHANGING:
-                    ours, wanted = getattr(model, field), getattr(environment.physics.model, field)
-                    np.testing.assert_array_equal(ours, wanted)
-            action = task.from_unit(rng.uniform(-1, 1, (SIMULATIONS, task.action_size)).astype(np.float32))
-            for sim, environment in enumerate(environments):
-                spec = environment.action_spec()
-                assert (spec.minimum <= action[sim]).all() and (action[sim] <= spec.maximum).all()
-                pair = [environment.step(action[sim].astype(float)) for _ in range(ACTION_REPEAT)]
-                steps[sim], reward[sim] = pair[-1], pair[0].reward + pair[1].reward
-            result = batch.step(action)
-            state = result.state
-            np.testing.assert_array_equal(result.reward, reward)
+def test_a_task_of_the_suite_is_dm_controls(task_id, monkeypatch):
+    task = get_task(task_id)
+    monkeypatch.setattr(task, "most_at_once", 1)  # the second episode in the same environment
+    made = rolled(task, [0, 1], max_steps=8)
+    for place in range(2):
+        environment = suite.load(*task_id.split("-", 1), {"random": 0})  # from which lqr draws its model
+        environment.physics._make_rendering_contexts = lambda: None  # terrain would be put on a graphics card
+        check_episode(task, made, place, environment)
 
 
 def test_actions_reach_the_bounds_of_quadruped_and_no_further():
