@@ -71,8 +71,10 @@ def test_numbers_out_of_range_and_cues_that_cannot_be_are_refused(name):
 
 @pytest.mark.parametrize("difficulty", ["harsh", "camera-camera", "sky0.1", "camera-", "0.1-color", ""])
 def test_other_words_are_refused_with_those_there_are(difficulty):
-    with pytest.raises(UnknownNameError, match="easy"):
+    with pytest.raises(UnknownNameError, match="Known: .*easy"):
         DistractorSetting("dynamic", difficulty)
+    with pytest.raises(UnknownNameError, match="Known: .*dynamic"):
+        DistractorSetting.parse(f"dynamik_{difficulty}")
 
 
 @pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "cartpole-swingup"])
