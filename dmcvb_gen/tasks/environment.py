@@ -272,9 +272,11 @@ class _Probe:
             with watched(task.error):
                 numbers = episode.step(rng.uniform(task.action_low, task.action_high))
             self._rows.append(np.concatenate([episode.full_state(), episode.state, numbers]))
-            self.models.append(model_values(episode.model))
+            if not task.trusted:
+                self.models.append(model_values(episode.model))
             if episode.over:
                 break
+        self.models.append(model_values(episode.model))
         self.kept = self._python_of(environment)
         self.assets = {name: zlib.crc32(value.data) for name, value in _arrays(episode.model, ASSETS).items()}
 
