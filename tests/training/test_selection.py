@@ -57,14 +57,50 @@ def test_the_episodes_that_decide_are_none_that_a_training_was_evaluated_on(step
     assert inspect.signature(evaluate).parameters["streams"].default == "evaluation"  # a training's
 
 
-def test_a_monotone_curve_gives_the_first_at_95_and_the_one_at_50():
-    found = select(rising())
-    assert found.convergence.converged and found.convergence.value == pytest.approx(1000, rel=0.01)
-    assert found.picks["expert"][0].step == 38_000 and found.picks["medium"][0].step == 20_000
-    mixed = [pick.step for pick in found.picks["mixed"]]
-    assert len(mixed) == MIXED_COUNT
-    np.testing.assert_allclose(mixed, np.linspace(0, 20_000, MIXED_COUNT), atol=1000)
-    assert found.reasons == {}
+LUCKY = np.concatenate([rising()[:20], np.full(5, 1000.0), rising()[25:]])
+STAIRS = np.concatenate([np.full(40, 300.0), np.linspace(300, 1000, 20), np.full(40, 1000.0)])
+COLLAPSE = np.concatenate([rising()[:40], np.full(35, 1000.0), np.linspace(1000, 50, 25)])
+
+
+@pytest.mark.parametrize(
+    ("given", "end", "first", "last"),
+    [
+        (dict(returns=rising()), 1000, 38_000, 38_000),
+        (dict(returns=rising(), noise=30.0), 1000, 37_000, 44_000),
+        (dict(returns=LUCKY, fresh=rising()), 1000, 38_000, 38_000),  # twenty lucky episodes; fresh ones say half
+        (dict(returns=STAIRS), 1000, 58_000, 60_000),  # a plateau before the top is not convergence of the whole
+        (dict(returns=COLLAPSE), 1000, 38_000, 38_000),
+        (dict(returns=rising(top=-50.0, base=-450.0), base=-450.0), -50, 38_000, 38_000),
+        (dict(returns=np.array([10.0, 300.0])), 300, 2000, 2000),
+    ],
+    ids=["plain", "noise", "luck", "stairs", "collapse", "costs", "two evaluations"],
+)
+def test_expert_is_the_first_at_95_percent_of_the_way_and_medium_lies_at_half(given, end, first, last):
+    found, base = select(**given), given.get("base", 0.0)
+    assert found.convergence.converged and found.convergence.value == pytest.approx(end, abs=0.02 * (end - base))
+    [expert] = found.picks["expert"]
+    assert first <= expert.step <= last
+    assert expert.evaluation.mean - base >= 0.95 * (found.convergence.value - base)
+    if len(given["returns"]) > 2:
+        assert (found.picks["medium"][0].evaluation.mean - base) / (end - base) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("returns", "level", "words"),
+    [
+        (np.linspace(10, 1000, 100), "expert", "still rises"),
+        (rising()[:1], "expert", "1 evaluation, at least 2 are needed"),
+        (np.full(100, -3.0), "medium", "never rose"),
+        (
+            np.concatenate([np.full(30, 20.0), np.full(70, 1000.0)]),
+            "mixed",
+            "evaluate more often",
+        ),  # jumps over the half
+    ],
+)
+def test_what_cannot_be_picked_says_why(returns, level, words):
+    found = select(returns)
+    assert words in found.reasons[level] and level not in found.picks
 
 
 def test_mixed_is_even_in_training_steps_not_in_return():
@@ -77,50 +113,6 @@ def test_mixed_is_even_in_training_steps_not_in_return():
     np.testing.assert_allclose(steps, np.linspace(0, medium.step, MIXED_COUNT), atol=1000)
     assert found.picks["mixed"][-1].path == medium.path
     assert sum(pick.evaluation.mean < 20 for pick in found.picks["mixed"]) == 6
-
-
-def test_noise_moves_the_picks_little_and_fresh_episodes_decide():
-    found = select(rising(), noise=30.0)
-    assert 37_000 <= found.picks["expert"][0].step <= 44_000
-    assert found.picks["expert"][0].evaluation.mean >= 0.95 * found.convergence.value
-    assert abs(found.picks["medium"][0].evaluation.mean / found.convergence.value - 0.5) <= 0.1
-
-
-def test_lucky_evaluations_do_not_make_an_expert():
-    seen, truth = rising(), rising()
-    seen[20:25] = 1000  # twenty lucky episodes; fresh ones say half
-    found = select(seen, fresh=truth)
-    assert found.picks["expert"][0].step == 38_000
-
-
-def test_a_plateau_before_the_top_is_not_convergence_of_the_whole():
-    returns = np.concatenate([np.full(40, 300.0), np.linspace(300, 1000, 20), np.full(40, 1000.0)])
-    found = select(returns)
-    assert found.convergence.value == pytest.approx(1000, rel=0.01) and found.picks["expert"][0].step >= 58_000
-
-
-def test_a_collapse_after_the_peak_keeps_the_peak():
-    returns = np.concatenate([rising()[:40], np.full(35, 1000.0), np.linspace(1000, 50, 25)])
-    found = select(returns)
-    assert found.convergence.value == pytest.approx(1000, rel=0.01) and found.picks["expert"][0].step == 38_000
-
-
-def test_negative_returns_count_from_the_random_policy():
-    found = select(rising(top=-50.0, base=-450.0), base=-450.0)
-    assert found.convergence.value == pytest.approx(-50, abs=2)
-    assert found.picks["expert"][0].evaluation.mean >= -50 - 0.05 * 400 - 1
-    assert found.picks["medium"][0].evaluation.mean == pytest.approx(-250, abs=41)
-
-
-def test_a_curve_that_still_rises_has_no_expert_yet_and_says_so():
-    found = select(np.linspace(10, 1000, 100))
-    assert not found.convergence.converged and "still rises" in found.reasons["expert"]
-    assert "medium" in found.picks
-
-
-def test_a_short_run_has_nothing_yet():
-    found = select(rising()[:1])
-    assert "1 evaluation, at least 2 are needed" in found.reasons["expert"] and "expert" not in found.picks
 
 
 @pytest.mark.parametrize(
@@ -136,23 +128,6 @@ def test_a_few_evaluations_are_enough_and_say_how_sure_they_are(returns, value, 
     end = converge(list(range(len(returns))), returns)
     assert (end.value, end.converged) == (value, converged) and words in end.standing
     assert end.error == error or (error is None and np.isnan(end.error))
-
-
-def test_two_evaluations_make_an_expert():
-    found = select(np.array([10.0, 300.0]))
-    assert found.picks["expert"][0].step == 2000
-
-
-def test_a_run_that_never_left_the_floor_has_nothing():
-    found = select(np.full(100, -3.0))
-    assert found.picks == {} and "never rose" in found.reasons["medium"]
-
-
-def test_a_jump_over_the_half_says_what_is_missing():
-    returns = np.concatenate([np.full(30, 20.0), np.full(70, 1000.0)])
-    found = select(returns)
-    assert "expert" in found.picks and "evaluate more often" in found.reasons["medium"]
-    assert found.reasons["mixed"] == found.reasons["medium"]
 
 
 def test_checkpoints_too_far_apart_for_mixed_say_which_is_missing():
