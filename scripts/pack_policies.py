@@ -20,7 +20,7 @@ from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze
 
 PAGE = Path(__file__).parents[1] / "docs/policies.md"
-TABLE = re.compile(r"(?<=<!-- scripts/pack_policies.py -->\n).*?(?=<!-- end -->)", re.DOTALL)
+TABLE = re.compile(r"(?<=<!-- scripts/pack_policies.py -->\n\n).*?(?=\n<!-- end -->)", re.DOTALL)
 HEAD = "| task | level | return | the paper's | TD-MPC2, SAC | agent step | minutes |\n|---|---|---|---|---|---|---|\n"
 OTHERS = {
     "ball_in_cup-catch": (986, 978),
