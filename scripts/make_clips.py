@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import colorsys
+import contextlib
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,8 +26,6 @@ SETTLING = 0.8
 """Seconds that the heap has to come to rest before the film begins."""
 QUALITY = 72
 """WebP quality of the files."""
-SCENES = 20
-"""Scenes that are drawn from a clip's stream, at most, until one has no degenerate mesh."""
 SPLITS = ("train", "val")
 
 
@@ -232,6 +231,12 @@ def _png(picture: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
+def _quads(rows: int, columns: int) -> list[tuple[int, int, int, int]]:
+    """Corners of the quads of a grid of points that is closed in both directions, row by row."""
+    places = [(i, j, (i + 1) % rows, (j + 1) % columns) for i in range(rows) for j in range(columns)]
+    return [(i * columns + j, m * columns + j, m * columns + n, i * columns + n) for i, j, m, n in places]
+
+
 def _revolution(rng: np.random.Generator, size: float) -> str:
     """Vertices and faces of a vase: a random profile turned around its axis."""
     rings, sides = 9, 18
@@ -241,15 +246,10 @@ def _revolution(rng: np.random.Generator, size: float) -> str:
     side = np.stack([np.outer(profile, np.cos(angle)), np.outer(profile, np.sin(angle))], -1)
     points = np.concatenate([side, np.broadcast_to(height[:, None, None], (rings, sides, 1))], -1).reshape(-1, 3)
     points = np.concatenate([points, [[0, 0, height[0]], [0, 0, height[-1]]]])
-    faces = []
-    for ring in range(rings - 1):
-        for k in range(sides):
-            a, b = ring * sides + k, ring * sides + (k + 1) % sides
-            faces += [[a, b, b + sides], [a, b + sides, a + sides]]
+    faces = [face for a, b, c, d in _quads(rings, sides)[:-sides] for face in ([a, d, c], [a, c, b])]
+    bottom, top, last = rings * sides, rings * sides + 1, (rings - 1) * sides
     for k in range(sides):
-        a, b = k, (k + 1) % sides
-        last = (rings - 1) * sides
-        faces += [[rings * sides, b, a], [rings * sides + 1, last + a, last + b]]
+        faces += [[bottom, (k + 1) % sides, k], [top, last + k, last + (k + 1) % sides]]
     return f'vertex="{_numbers(points)}" face="{" ".join(map(str, np.ravel(faces)))}"'
 
 
@@ -259,12 +259,7 @@ def _torus(rng: np.random.Generator, size: float) -> str:
     u, v = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(tube) * 2 * np.pi / tube, indexing="ij")
     radius = 1 + thick * np.cos(v)
     points = np.stack([radius * np.cos(u), radius * np.sin(u), thick * np.sin(v)], -1).reshape(-1, 3) * size
-    faces = []
-    for i in range(around):
-        for j in range(tube):
-            a, b = i * tube + j, ((i + 1) % around) * tube + j
-            c, d = ((i + 1) % around) * tube + (j + 1) % tube, i * tube + (j + 1) % tube
-            faces += [[a, b, c], [a, c, d]]
+    faces = [face for a, b, c, d in _quads(around, tube) for face in ([a, b, c], [a, c, d])]
     return f'vertex="{_numbers(points)}" face="{" ".join(map(str, np.ravel(faces)))}"'
 
 
@@ -388,14 +383,11 @@ def _scene(rng: np.random.Generator) -> tuple[str, dict[str, bytes], np.ndarray]
 def make_clip(seed: int, split: str, index: int) -> np.ndarray:
     """One clip, (24, 256, 256, 3) uint8; every (seed, split, index) has its own objects."""
     rng = np.random.default_rng([seed, SPLITS.index(split), index])
-    for attempt in range(SCENES):
+    model = None
+    while model is None:
         xml, assets, velocities = _scene(rng)
-        try:
+        with contextlib.suppress(ValueError):  # a degenerate random mesh: draw another scene from the same stream
             model = mujoco.MjModel.from_xml_string(xml, assets)
-            break
-        except ValueError:  # a degenerate random mesh: draw another scene from the same stream
-            if attempt == SCENES - 1:
-                raise
     data, step = mujoco.MjData(model), model.opt.timestep
     mujoco.mj_step(model, data, nstep=round(SETTLING / step))
     speed = data.qvel.reshape(-1, 6)
@@ -416,14 +408,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--videos", type=int, default=8, help="clips for each of train and val")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the clips; those that are there are kept")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the clips")
     options = parser.parse_args()
     for split in SPLITS:
         (options.out / split).mkdir(parents=True, exist_ok=True)
         for index in range(options.videos):
             path = options.out / split / f"clip_{index:03d}.webp"
-            if path.exists():
-                continue
             first, *others = map(Image.fromarray, make_clip(options.seed, split, index))
             duration = round(1000 / FRAMES_PER_SECOND)
             first.save(path, save_all=True, append_images=others, duration=duration, loop=0, quality=QUALITY, method=6)
