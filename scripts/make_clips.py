@@ -1,5 +1,6 @@
 """Make clips of objects that fall and collide, like Kubric's MOVi-D, from a seed: the kind that the package brings.
 
+MUJOCO_GL=egl python scripts/make_clips.py --seed 2024 --out clips              # those of the package
 MUJOCO_GL=egl python scripts/make_clips.py --videos 60 --seed 1 --out clips
 dmcvb-gen rollout walker-walk --distractor dynamic --backgrounds clips
 
