@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import shutil
 from pathlib import Path
 
 
 class Bucket:
-    """One bucket at a server of this process's own; `close` ends it.
+    """One bucket at a server of this process's own; `close` ends it. Its keys are in the environment.
 
     Attributes:
       url: of the release in it.
@@ -20,14 +22,15 @@ class Bucket:
         import boto3
         from moto.server import ThreadedMotoServer
 
+        logging.getLogger("werkzeug").setLevel(logging.ERROR)  # a line for each request
+        os.environ |= {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
         self._server = ThreadedMotoServer(port=0, verbose=False)
         self._server.start()
         host, port = self._server.get_host_and_port()
         endpoint = f"http://{host}:{port}"
-        keys = {"aws_access_key_id": "key", "aws_secret_access_key": "secret", "region_name": "us-east-1"}
-        self._client = boto3.client("s3", endpoint_url=endpoint, **keys)
+        self._client = boto3.client("s3", endpoint_url=endpoint)
         self._client.create_bucket(Bucket="campaign")
-        self.options = ["--option", "key=key", "--option", "secret=secret", "--option", f"endpoint_url={endpoint}"]
+        self.options = ["--option", f"endpoint_url={endpoint}"]
 
     def _keys(self) -> list[str]:
         pages = self._client.get_paginator("list_objects_v2").paginate(Bucket="campaign")

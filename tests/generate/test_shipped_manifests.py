@@ -11,6 +11,8 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.generate.recipe import load_recipe
+from dmcvb_gen.generate.resolve import resolve
 from dmcvb_gen.generate.shipped import ENDING, load_shipped, pack, shipped_manifests
 
 
@@ -29,6 +31,13 @@ def test_a_random_shard_of_each_has_the_released_bytes(name, tmp_path):
         words = ["--only", record.name, "--range", f"{first}:{first + 1}", "--out", tmp_path / record.family]
         done = run("--manifest", name, *words)
         assert done.exit_code == 0 and "made again with the same digest" in done.output, done.output
+
+
+@pytest.mark.slow_cases("dmcvb-mini", "dmcvb-v1")
+@pytest.mark.parametrize("name", shipped_manifests())
+def test_the_recipe_of_each_still_resolves_to_the_released_layers_and_job_keys(name):
+    pixels = name != "dmcvb-v1"  # which was made without images
+    assert resolve(load_recipe(name), pixels=pixels).resolved.sha256 in load_shipped(name).manifest.recipes
 
 
 @pytest.mark.parametrize("release", ["small_release", "small_mazes"])
