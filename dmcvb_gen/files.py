@@ -8,6 +8,7 @@ left by a killed process.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import hashlib
 import json
@@ -17,7 +18,7 @@ import tempfile
 from collections.abc import Iterator
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 try:
     import fcntl
@@ -26,6 +27,8 @@ except ImportError:  # Windows: nothing is locked, so what killed processes left
 
 PARTIAL = ".partial"
 """Ending of files in the making."""
+LASTING = (errno.EEXIST, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.EIO)
+"""Errors that another way of writing would meet, too."""
 LARGEST_YAML = 100_000
 """Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes seconds for it at worst."""
 
@@ -56,6 +59,24 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise
     finally:
         os.close(handle)
+
+
+@contextlib.contextmanager
+def creating(path: Path) -> Iterator[BinaryIO]:
+    """Give an open file without a name, which becomes `path` when the block ends well; a killed process leaves nothing.
+
+    Raises:
+      FileExistsError: something is at `path`; it stays.
+      OSError: it cannot be written, or the system or the disk knows no such files (see `LASTING`).
+    """
+    if not hasattr(os, "O_TMPFILE"):
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP), str(path))
+    with os.fdopen(os.open(path.parent, os.O_TMPFILE | os.O_WRONLY, 0o666), "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+        # Given a handle, Python follows the link that /proc has for an open file.
+        os.link(f"/proc/self/fd/{file.fileno()}", path, src_dir_fd=file.fileno(), follow_symlinks=True)
 
 
 def _lock(handle: int) -> bool:

@@ -67,6 +67,11 @@ class Step:
     arguments: tuple[str, ...]
     place: str = "folder"
 
+    @property
+    def uses_bucket(self) -> bool:
+        """Whether it reads or writes the bucket."""
+        return "{url}" in self.arguments
+
 
 STEPS = (
     Step("light rollout", None, ("rollout", "{kind}", "--episodes", "2", "--no-pixels", *SMALL, "--out", "{out}")),
@@ -91,12 +96,13 @@ class History:
             ended = self.run(step, folder)
             if ended.code != 0:
                 sys.exit(f"{kind}: {step.name} failed without a fault: {ended.said}")
-            self.bucket.bring(objects)
+            if step.uses_bucket:
+                self.bucket.bring(objects)
             self.after[step.name] = folder, objects
             self.seconds[step.name] = ended.seconds
 
     def lay(self, step: Step) -> tuple[Path, Path]:
-        """A folder and a copy of a bucket as they are before a step; the bucket holds the latter's objects."""
+        """A folder and a copy of a bucket as they are before a step; a bucket that it uses holds these objects."""
         place = Path(tempfile.mkdtemp(dir=_made(self.scratch)))
         folder, objects = place / "release", place / "objects"
         objects.mkdir()
@@ -105,19 +111,25 @@ class History:
             if step.name != "fetch":
                 shutil.copytree(before[0], folder)
             shutil.copytree(before[1], objects, dirs_exist_ok=True)
-        self.bucket.fill(objects)
+        if step.uses_bucket:
+            self.bucket.fill(objects)
         return folder, objects
 
     def run(self, step: Step, folder: Path, strike: tuple[str, int] | None = None, after: float | None = None) -> Ended:
         """Run a step, struck at the k-th operation, or by a signal after so many seconds."""
         filled = {"{out}": [str(folder)], "{url}": [self.bucket.url], "{kind}": KINDS[self.kind]}
         arguments = [word for given in step.arguments for word in filled.get(given, [given])]
-        if step.place == "bucket" or step.name == "fetch":
-            arguments += self.bucket.options
+        arguments += self.bucket.options if step.uses_bucket else []
         name = strike[0] if strike else ""
         if name.startswith("SIG"):
-            number = getattr(signal, name)
-            return Command(arguments, folder).finish(after, lambda command: os.killpg(command.pid, number) is None)
+
+            def stop(command: Command) -> bool:
+                with contextlib.suppress(ProcessLookupError):  # it has just ended
+                    os.killpg(command.pid, getattr(signal, name))
+                    return True
+                return False
+
+            return Command(arguments, folder).finish(after, stop)
         return Command(arguments, folder.parent, strike).finish()
 
     def digest(self, step: Step, folder: Path, objects: Path) -> str | None:

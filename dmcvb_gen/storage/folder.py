@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import stat
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from filelock import FileLock
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import flush_folder, sha256_file
+from dmcvb_gen.files import LASTING, creating, flush_folder, sha256_file
 from dmcvb_gen.storage.interface import ANY, PIECE, Store
 
 LOCK = ".lock"
 """File that is locked to replace a file, and to create one where the disk knows no links."""
-LASTING = (errno.EEXIST, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.EIO)
-"""Errors that another way of writing would meet, too."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,8 @@ class LocalStore(Store):
                     os.fsync(file.fileno())
                 os.link(data, full)
             else:
-                _write_unnamed(data, full)
+                with creating(full) as out:
+                    _write(data, out)
         except OSError as error:
             if error.errno in LASTING:
                 raise
@@ -118,27 +117,13 @@ class LocalStore(Store):
         self._at(path).unlink()
 
 
-def _write(data: bytes | Path, handle: int) -> None:
-    """Write bytes, or a file's, to an open file, and flush it to the disk."""
-    with open(handle, "wb", closefd=False) as out:
-        if isinstance(data, Path):
-            with data.open("rb") as source:
-                shutil.copyfileobj(source, out, PIECE)
-        else:
-            out.write(data)
-        out.flush()
-        os.fsync(handle)
-
-
-def _write_unnamed(data: bytes | Path, full: Path) -> None:
-    """Write a file that gets its name when it is whole, so that a killed process leaves nothing behind."""
-    handle = os.open(full.parent, os.O_TMPFILE | os.O_WRONLY, 0o666)
-    try:
-        _write(data, handle)
-        # Given a handle, Python follows the link that /proc has for an open file.
-        os.link(f"/proc/self/fd/{handle}", full, src_dir_fd=handle, follow_symlinks=True)
-    finally:
-        os.close(handle)
+def _write(data: bytes | Path, out: BinaryIO) -> None:
+    """Write bytes, or a file's, to an open file."""
+    if isinstance(data, Path):
+        with data.open("rb") as source:
+            shutil.copyfileobj(source, out, PIECE)
+    else:
+        out.write(data)
 
 
 def _write_over(data: bytes | Path, full: Path) -> None:
@@ -147,7 +132,9 @@ def _write_over(data: bytes | Path, full: Path) -> None:
     partial.unlink(missing_ok=True)
     try:
         with partial.open("xb") as file:
-            _write(data, file.fileno())
+            _write(data, file)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(partial, full)
     finally:
         partial.unlink(missing_ok=True)

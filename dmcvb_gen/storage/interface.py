@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import errno
 import hashlib
-import os
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.files import LASTING, creating, replacing
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.storage.errors import storage_errors
 
@@ -189,12 +189,18 @@ class Store(abc.ABC):
         target = Path(target)
         with storage_errors(target.parent, "write to"):
             target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=target.parent, prefix=".", suffix=".partial") as partial:
-                self._bring(path, partial, size, sha256)
-                os.chmod(partial.name, 0o644)
-                _put_new(Path(partial.name), target)
+            try:
+                with creating(target) as out:
+                    self._bring(path, out, size, sha256)
+            except OSError as error:
+                if error.errno == errno.EEXIST:
+                    return
+                if error.errno in LASTING:
+                    raise
+                with replacing(target) as partial, partial.open("wb") as out:  # the disk knows no such files
+                    self._bring(path, out, size, sha256)
 
-    def _bring(self, path: str, out: Any, size: int, sha256: str) -> None:
+    def _bring(self, path: str, out: BinaryIO, size: int, sha256: str) -> None:
         digest, pieces = hashlib.sha256(), self._pieces(path, size + 1)
         while True:
             with self._errors(path, "read"):
@@ -205,8 +211,6 @@ class Store(abc.ABC):
             out.write(piece)
         if out.tell() != size or digest.hexdigest() != sha256:
             raise StoreError(f"{self.place}/{path} does not have the size or SHA-256 of its list; it was not kept")
-        out.flush()
-        os.fsync(out.fileno())
 
     def _found(self, path: str | None, look: Callable[[], Any], default: Any) -> Any:
         """What `look` gives; the default if nothing is there."""
@@ -315,14 +319,3 @@ class Store(abc.ABC):
             for secret in self._secrets():
                 message = message.replace(secret, "...")
             raise type(error)(message) from None
-
-
-def _put_new(temporary: Path, target: Path) -> None:
-    """Give a file a second name that nothing has; what has it stays, and where names are single, take its place."""
-    try:
-        os.link(temporary, target)
-    except FileExistsError:
-        pass
-    except OSError:
-        os.replace(temporary, target)
-        temporary.touch()  # for the one who deletes it
