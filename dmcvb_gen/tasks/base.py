@@ -234,9 +234,7 @@ class Task(abc.ABC):
 
     def at(self, action_repeat: int) -> Task:
         """This task at an action repeat; its time limits last as long, in other numbers of agent steps."""
-        if action_repeat == self.action_repeat:
-            return self
-        made = self.__dict__.setdefault("_at", {})
+        made = self.__dict__.setdefault("_at", {self.action_repeat: self})  # which copies share
         if action_repeat not in made:
             made[action_repeat] = other = copy.copy(self)
             other.action_repeat = action_repeat
