@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from dmcvb_gen.commands import export, fetch, publish, validate, verify
 from dmcvb_gen.generate.returns import evaluate_behaviour
 from dmcvb_gen.loaders.register import register_with_gymnasium
-from dmcvb_gen.making import paint, regenerate, repaint, rollout
+from dmcvb_gen.making import make, paint, regenerate, repaint, rollout
 from dmcvb_gen.training.behaviour import train_behaviour
 from dmcvb_gen.version import __version__
 
@@ -22,6 +22,7 @@ __all__ = [
     "evaluate_behaviour",
     "export",
     "fetch",
+    "make",
     "open",
     "paint",
     "publish",
@@ -32,6 +33,10 @@ __all__ = [
     "validate",
     "verify",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def open(
@@ -67,9 +72,10 @@ def open(
     return open_for_reading(path, storage_options, digest)
 
 
-def evaluate(policy: Any, where: str, **options: Any) -> Score:
+def evaluate(policy: Any, where: Any, **options: Any) -> Score:
     """Score a policy of your own: `dmcvb_gen.evaluate(policy, "walker-walk/dynamic", episodes=30, seed=0)`.
 
+    A subset instead of a name gives its size, renderer, videos and time limit, and a score that is normalized.
     The protocol, starts and videos are those of `validate`. See `dmcvb_gen.benchmarks.evaluate.evaluate` for what the
     policy gets and gives, and for all options.
 

@@ -4,8 +4,12 @@ The options of a command are made from its function: types and defaults from the
 docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resumes if it is made again.
 """
 
+import hashlib
+import json
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+from annotated_types import Gt, Lt
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import (
@@ -22,6 +26,7 @@ from dmcvb_gen.options import (
     progress_bar,
 )
 from dmcvb_gen.parallel import Workers, ignore
+from dmcvb_gen.spec import is_maze, subset_name
 from dmcvb_gen.text import as_names, quoted
 
 if TYPE_CHECKING:
@@ -109,6 +114,81 @@ def rollout(
     with progress_bar(progress, f" {plan.unit}", plan.release.manifest.name) as bar:
         run_plan(plan, workers, bar)
     return open_for_reading(plan.release.place if out is None else str(out), storage_options)
+
+
+class Made(NamedTuple):
+    """Data and the environment that matches them; `val` has the episodes that are held out of `train`."""
+
+    env: Any
+    train: Any
+    val: Any
+
+
+@checked
+def make(
+    name: str,
+    *,
+    episodes: Count | None = None,
+    release: Location | None = None,
+    held_out: Annotated[float, Gt(0), Lt(1)] = 0.1,
+    seed: Seed = 0,
+    environment: dict[str, Any] | None = None,
+    **options: Any,
+) -> Made:
+    """Data and their environment: `env, train, val = dmcvb_gen.make("walker-walk/expert/dynamic", episodes=200)`.
+
+    The data are made at the first call, in a folder of the user's cache, and read from there afterwards. With `release`
+    nothing is made.
+
+    Args:
+      name: TASK/LEVEL/SETTING; a level may be a union ("medium-expert").
+      episodes: Episodes, of each level. [default: those of `rollout`, or all of the release]
+      release: Folder or URL of a release to read.
+      held_out: Share of the episodes that `val` has, one at least.
+      seed: Random seed of the data, and of the choice of those episodes.
+      environment: Options of `SubsetReader.environment`: stack, split, num_envs, ...
+      options: Options of `rollout` for the data: size, max_steps, renderer, workers, ...
+
+    Raises:
+      DmcvbError: no such task, level or setting, or the release does not hold them.
+    """
+    import numpy as np
+
+    from dmcvb_gen.loaders import UnionReader, open_for_reading
+
+    try:
+        task, level, setting = name.rsplit("/", 2)
+    except ValueError:
+        raise DmcvbError(f"{name!r} names no subset; give TASK/LEVEL/SETTING: walker-walk/expert/dynamic") from None
+    name = subset_name(task, level, setting)
+    if release is not None:
+        if options:
+            raise DmcvbError(f"{min(options)} has no effect: with a release, nothing is made; remove it")
+        opened = open_for_reading(str(release))
+    else:
+        options |= {"goals" if is_maze(task) else "distractors": setting, "seed": seed}
+        opened = _cached(task, level.split("-"), episodes, options)
+    train, val = [], []
+    for part in opened.parts_of(name) or [name]:
+        subset = opened[part]
+        order = np.random.default_rng(seed).permutation(subset.episodes[:episodes])
+        if len(order) < 2:
+            raise DmcvbError(f"{part} has {len(order)} episodes; give 2 or more, for train and val")
+        count = max(1, round(held_out * len(order)))
+        train.append(subset.part(order[count:]))
+        val.append(subset.part(order[:count]))
+    learned, held = (one[0] if len(one) == 1 else UnionReader(opened, one) for one in (train, val))
+    return Made(learned.environment(**environment or {}), learned, held)
+
+
+def _cached(task: str, levels: list[str], episodes: int | None, options: dict[str, Any]) -> "ReleaseReader":
+    """Roll a task out in the user's cache; a folder for each choice of options but the number of episodes."""
+    from dmcvb_gen.policies.archives import cache_folders
+
+    decide = {key: str(value) for key, value in options.items() if key not in ("workers", "progress")}
+    mark = hashlib.sha256(json.dumps([task, levels, decide], sort_keys=True).encode()).hexdigest()[:12]
+    folder = cache_folders()[0].parent / "made" / mark
+    return rollout(task, levels=levels, episodes=episodes, out=folder, **options)
 
 
 @checked

@@ -61,7 +61,8 @@ def reader(tmp_path_factory):
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     keys = {"AWS_ACCESS_KEY_ID": "docs", "AWS_SECRET_ACCESS_KEY": "docs", "AWS_DEFAULT_REGION": "us-east-1"}
     urllib.request.urlopen(urllib.request.Request(f"{address}/bucket", method="PUT")).close()
-    yield tmp_path_factory.mktemp("reader"), os.environ | keys | {"AWS_ENDPOINT_URL": address, "PATH": path}
+    folder, places = tmp_path_factory.mktemp("reader"), {"AWS_ENDPOINT_URL": address, "PATH": path}
+    yield folder, os.environ | keys | places | {"XDG_CACHE_HOME": str(folder / "cache")}
     urllib.request.urlopen(urllib.request.Request(f"{address}/moto-api/reset", method="POST")).close()
     server.stop()
 

@@ -15,19 +15,21 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from dmcvb_gen.dataset import Subset
+from dmcvb_gen.dataset.manifest import MAX_STEPS
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.files import replacing
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.recipe import NATIVE
+from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
@@ -67,6 +69,7 @@ class Score:
       success: share of the episodes that the task ended (mazes), else None.
       speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_speed`).
       limit: agent steps after which an episode was cut.
+      normalized: the mean, 0 for random actions and 100 for the data's expert; None where one of them is unknown.
       seconds: time that it took.
       pictures: (frame, size, size, 3) uint8, the first episode at even intervals; None for agents that see states.
     """
@@ -77,6 +80,7 @@ class Score:
     success: float | None = None
     speed: float | None = None
     limit: int | None = None
+    normalized: float | None = None
     seconds: float = 0.0
     pictures: np.ndarray | None = field(default=None, repr=False)
 
@@ -345,7 +349,7 @@ def check_actions(
 
 def evaluate(
     policy: Act,
-    where: str,
+    where: str | Subset,
     *,
     episodes: int = 30,
     seed: int = 0,
@@ -370,7 +374,8 @@ def evaluate(
       policy: takes {"pixels": (episode, stack x view x 3, size, size) uint8, "state": (episode, state) float32} and
         gives (episode, action) in the task's bounds, [-1, 1] for most, as a numpy array or anything that numpy can
         read.
-      where: TASK/SETTING: "walker-walk/dynamic", "ant-maze-empty7x7/visible".
+      where: TASK/SETTING: "walker-walk/dynamic", "ant-maze-empty7x7/visible"; or a subset, whose size, renderer, videos
+        and time limit are taken.
       episodes: number of episodes, each run once.
       seed: seed of starts and distractors; `validate` has 0. Each setting has starts of its own.
       stack: frames an observation, by default 3; the first one of an episode is repeated.
@@ -404,18 +409,38 @@ def evaluate(
     drawn = seen.get("renderer") or {"name": NATIVE, "samples": None}
     if renderer in (None, drawn["name"]):
         samples = drawn["samples"] if samples is None else samples
-    repeat = action_repeat or seen.get("action_repeat", ACTION_REPEAT)
-    shown: dict[str, Any] = dict(backgrounds=backgrounds, split=split, action_repeat=repeat)
-    shown |= dict(renderer=renderer or drawn["name"], samples=samples)
-    scene = EvaluationScene.parse(where, size=_own_value(policy, "picture_size", size, 64) if pixels else 64, **shown)
+    if isinstance(where, Subset):
+        _own_value(policy, "picture_size", where.record.size if pixels and size is None else size, 0)
+        own = dict(size=size, renderer=renderer, samples=samples, action_repeat=action_repeat)
+        scene = _scene_of(where, **own, backgrounds=backgrounds, split=split)
+        max_steps = min(max_steps or MAX_STEPS, where.record.max_steps)
+    else:
+        repeat = action_repeat or seen.get("action_repeat", ACTION_REPEAT)
+        shown: dict[str, Any] = dict(backgrounds=backgrounds, split=split, action_repeat=repeat)
+        shown |= dict(renderer=renderer or drawn["name"], samples=samples)
+        size = _own_value(policy, "picture_size", size, 64) if pixels else 64
+        scene = EvaluationScene.parse(where, size=size, **shown)
     limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
     evaluator = Evaluator(scene, pixels=pixels, stack=stack, **limits)
     try:
         if pixels and seen:
             _tell_differences(scene, evaluator, seen)
-        return evaluator.score(policy)
+        score = evaluator.score(policy)
     finally:
         evaluator.close()
+    if isinstance(where, Subset) and score.limit == where.record.max_steps:
+        return replace(score, normalized=normalized(score.mean, reference_returns(where.release, where.record)))
+    return score
+
+
+def _scene_of(subset: Subset, **given: Any) -> EvaluationScene:
+    """The scene of a subset, with what is given instead."""
+    if subset.record.goal_mode is GoalMode.FIXED:
+        raise DmcvbError(f"{subset.name} has fixed goals; score policies on them by `validate --benchmark b3`")
+    if given["backgrounds"] == EvaluationScene.backgrounds:
+        given["backgrounds"] = None
+    own = EvaluationScene.of(subset, given["backgrounds"])
+    return replace(own, **{name: value for name, value in given.items() if value is not None})
 
 
 def _own_value(policy: Act, name: str, given: Any, usual: Any) -> Any:

@@ -40,7 +40,6 @@ from dmcvb_gen.spec import (
     MAZE_TRAINED_LEVELS,
     VISIBLE,
     is_maze,
-    select,
     subset_name,
     task_folder,
 )
@@ -225,12 +224,12 @@ class Missing:
 
 
 def only(release: Release, patterns: Sequence[str]) -> Release:
-    """A release with the subsets that match, e.g. "walker-walk/expert/*".
+    """A release with the subsets that match, e.g. "walker-walk/expert/*" or both of "walker-walk/medium-expert/none".
 
     Raises:
       DmcvbError: a pattern matches none.
     """
-    names = select([record.name for record in release.manifest.subsets], list(patterns))
+    names = release.select(patterns)
     records = tuple(record for record in release.manifest.subsets if record.name in names)
     chosen = copy.copy(release)
     chosen.manifest = release.manifest.model_copy(update={"subsets": records})

@@ -49,17 +49,18 @@ def info(path, options, as_json):
                 format_bytes(subset["bytes"]),
                 f"{subset['bytes_per_step']:,.0f}",
                 *(f"{subset['returns'][key]:.1f}" for key in statistics),
+                "" if subset["normalized"] is None else f"{subset['normalized']:.0f}",
             )
         )
         if paper := subset["paper"]:
             numbers = (f"{paper[key]:.1f}" for key in statistics)
-            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers))
-    rows += [(name, f"0/{planned:,}", *[""] * 10) for name, planned in facts["missing"].items()]
+            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers, ""))
+    rows += [(name, f"0/{planned:,}", *[""] * 11) for name, planned in facts["missing"].items()]
     print_table(
-        ("subset", "episodes", "steps", "size", "B/step", *statistics),
+        ("subset", "episodes", "steps", "size", "B/step", *statistics, "score"),
         rows,
         title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"),
-        optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("size",), ("median",)),
+        optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("score",), ("size",), ("median",)),
     )
     size = format_bytes(facts["bytes"])
     click.echo(f"{facts['steps']:,} steps, {size}")

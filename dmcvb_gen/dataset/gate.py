@@ -38,7 +38,7 @@ from dmcvb_gen.dataset.manifest import (
     list_bytes_limit,
     list_path,
     merged_layers,
-    merged_subset,
+    merged_subsets,
     parse,
     record_bytes_limit,
     record_path,
@@ -157,11 +157,7 @@ class Release:
                 f"{store.place} holds no release (no {MANIFEST}); give the folder that `rollout --out` made"
             )
         layers = merged_layers(recipes)
-        subsets: dict[str, SubsetRecord] = {}
-        for recipe in recipes:
-            for subset in recipe.subsets:
-                there = subsets.get(subset.name)
-                subsets[subset.name] = subset if there is None else merged_subset(there, subset)
+        subsets = merged_subsets(subset for recipe in recipes for subset in recipe.subsets)
         newest = recipes[-1]
         wanted = newest.model_copy(update={"layers": tuple(layers.values()), "subsets": tuple(subsets.values())})
         return cls(store, wanted, None, False, None)
@@ -311,8 +307,20 @@ class Release:
         return Subset(self, record)
 
     def select(self, patterns: Sequence[str] = ()) -> list[str]:
-        """Names of the manifest's subsets that fit any pattern such as "walker-walk/*/static", all by default."""
-        return list(select([record.name for record in self.manifest.subsets], list(patterns)))
+        """Names of the manifest's subsets that fit any pattern such as "walker-walk/*/static", all by default.
+
+        The name of a union stands for its parts.
+        """
+        each = [part for pattern in patterns for part in self.parts_of(pattern) or [pattern]]
+        return list(select([record.name for record in self.manifest.subsets], each))
+
+    def parts_of(self, name: str) -> list[str]:
+        """Names of the subsets whose union a name such as "walker-walk/medium-expert/none" is; [] if it is none."""
+        known = [record.name for record in self.manifest.subsets]
+        task, _, rest = name.partition("/")
+        levels, _, setting = rest.partition("/")
+        parts = [f"{task}/{level}/{setting}" for level in levels.split("-")]
+        return parts if name not in known and len(parts) > 1 and set(parts) <= set(known) else []
 
     def __iter__(self) -> Iterator[str]:
         """Names of the subsets that have episodes here."""

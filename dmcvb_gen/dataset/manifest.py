@@ -24,7 +24,7 @@ import pydantic
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json, sha256_bytes
-from dmcvb_gen.spec import LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec
+from dmcvb_gen.spec import LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec, parse_setting
 
 MANIFEST, COPY = "manifest.json", "copy.json"
 RECIPES, RECORDS, LAYERS, MANIFESTS, PROVENANCE = "recipes/", "records/", "layers/", "manifests/", "provenance/"
@@ -291,12 +291,12 @@ class SubsetRecord(_Model):
     @property
     def distractor(self) -> DistractorSetting:
         """The distractor of its images; "none" for mazes."""
-        return self.spec.distractor
+        return parse_setting(self.task, self.setting)[0]
 
     @property
     def goal_mode(self) -> GoalMode | None:
         """Treatment of a maze's goal; None for tasks without one."""
-        return self.spec.goal
+        return parse_setting(self.task, self.setting)[1]
 
     @property
     def imported(self) -> bool:
@@ -566,11 +566,9 @@ def build_manifest(
     whole = [(recipe, subset) for recipe in recipes for subset in recipe.subsets if _is_whole(subset, layers, lists)]
     if not whole:
         return None
-    subsets: dict[str, SubsetRecord] = {}
+    subsets = merged_subsets(subset for _, subset in whole)
     needed: dict[str, int] = {}
     for _, subset in whole:
-        there = subsets.get(subset.name)
-        subsets[subset.name] = subset if there is None else merged_subset(there, subset)
         for name in subset.layers:
             needed[name] = max(needed.get(name, 0), layers[name].shards_for(subset.episodes))
     made = {name: LayerList(shards=lists[name][:count]) for name, count in sorted(needed.items())}
@@ -612,7 +610,7 @@ def _without_needless(whole: Iterable[tuple[Resolved, SubsetRecord]]) -> list[Re
 
 
 def _covers(one: SubsetRecord, other: SubsetRecord) -> bool:
-    return one.name == other.name and merged_subset(one, other) == one
+    return one.name == other.name and _merged(one, other) == one
 
 
 def _described(recipe: Resolved) -> tuple[Any, ...]:
@@ -636,12 +634,20 @@ def _is_whole(subset: SubsetRecord, layers: Mapping[str, Layer], lists: Mapping[
     return all(len(lists.get(name, ())) >= layers[name].shards_for(subset.episodes) for name in subset.layers)
 
 
-def merged_subset(one: SubsetRecord, other: SubsetRecord) -> SubsetRecord:
-    """One subset that two recipes ask for: the larger number of episodes, the layers of both.
+def merged_subsets(records: Iterable[SubsetRecord]) -> dict[str, SubsetRecord]:
+    """All subsets of recipes, by name; one that several ask for has the most episodes and the layers of all.
 
     Raises:
-      StoreError: they differ in anything else.
+      StoreError: two descriptions of one subset differ in anything else.
     """
+    subsets: dict[str, SubsetRecord] = {}
+    for record in records:
+        there = subsets.get(record.name)
+        subsets[record.name] = record if there is None else _merged(there, record)
+    return subsets
+
+
+def _merged(one: SubsetRecord, other: SubsetRecord) -> SubsetRecord:
     for field in SubsetRecord.model_fields:
         first, second = getattr(one, field), getattr(other, field)
         if field not in ("episodes", "layers") and first != second:

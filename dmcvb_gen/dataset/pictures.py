@@ -81,17 +81,6 @@ def view_arrays(folder: str, views: Sequence[str]) -> tuple[str, ...]:
     return (folder,) if tuple(views) == ONE_VIEW else tuple(f"{folder}/{view}" for view in views)
 
 
-def stored_pictures(record: SubsetRecord, goal: bool) -> tuple[str, ...]:
-    """Names of the picture arrays that a subset has once it is painted.
-
-    Args:
-      goal: True if its task has a goal that can be left out of pictures.
-    """
-    if record.only_shown:
-        return picture_arrays(record.views, record.hidden_goal)
-    return picture_arrays(record.views) + (picture_arrays(record.views, hide_goal=True) if goal else ())
-
-
 def picture_of(array: str) -> tuple[str, bool] | None:
     """(view, goal hidden) of a picture array's name; None for the name of another array."""
     folder, _, view = array.partition("/")

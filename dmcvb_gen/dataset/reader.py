@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -118,14 +118,21 @@ class Subset:
     Attributes:
       release: the `gate.Release` that it belongs to.
       record: its entry in the manifest.
+      fresh: True if each epoch shows other distractors.
+      epoch: epoch of the distractors; 0 if they are those of the data.
+      looks: settings whose images stand side by side in each array of images; 1 but for `paired`.
     """
+
+    fresh = False
+    epoch = 0
+    looks = 1
 
     def __init__(self, release: Any, record: SubsetRecord):
         self.release, self.record = release, record
 
-    def read_as(self, kind: Callable[..., Any], *options: Any) -> Any:
-        """The same subset as another class of subset."""
-        return kind(self.release, self.record, *options)
+    def set_epoch(self, epoch: int) -> None:
+        """Show the distractors of another epoch from now on, if they are fresh."""
+        self.epoch = epoch if self.fresh else 0
 
     @property
     def name(self) -> str:
@@ -151,7 +158,7 @@ class Subset:
         return len(self._episodes)
 
     def __getstate__(self) -> dict[str, Any]:  # Zarr handles are opened again where the subset lands
-        return {"release": self.release, "record": self.record}
+        return {name: value for name, value in self.__dict__.items() if name != "_opened"}
 
     # -- layers and arrays ----------------------------------------------------------------------------
 
@@ -275,8 +282,11 @@ class Subset:
     @property
     def bytes(self) -> int:
         """Bytes of all its files that are here; settings that share trajectories count them each."""
-        shards = self.release.shards([self.name])
-        return sum(file.bytes for shard in shards if shard.here for file in shard.files)
+        return sum(file.bytes for shard in self.shards() if shard.here for file in shard.files)
+
+    def shards(self, episodes: tuple[int, int] | None = None) -> Iterator[Any]:
+        """Its shards, or those with some episodes, (first, last + 1); see `gate.Release.shards`."""
+        return self.release.shards([self.name], episodes)
 
     def read(self, array: str, episodes: slice | Iterable[int] | None = None) -> np.ndarray:
         """Values of one array.

@@ -30,8 +30,7 @@ Rows past L are never written: a missing chunk costs no storage.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -51,69 +50,21 @@ PIXEL_CHUNK_STEPS = 32
 """Steps of a chunk of images: the unit of reading (chosen with scripts/bench_store.py)."""
 
 
-@dataclass(frozen=True)
-class EpisodeShape:
-    """Shape of a task's episodes: all that the layout needs to know of the task.
-
-    Attributes:
-      views: names of the images of a frame, in their order; ("pixels",) for one.
-      goal: True if there are images with the goal hidden beside them.
-      state_fields: name -> (first, last + 1) in the state.
-      action_low, action_high: (action,) bounds of the environment's actions.
-      state_size, physics_size: entries of one step.
-      materials: materials whose colors are labels.
-      max_steps: transitions at which the time limit ends an episode.
-      attributes: what else is stored with the arrays of these names.
-    """
-
-    views: tuple[str, ...]
-    goal: bool
-    state_fields: Mapping[str, tuple[int, int]]
-    action_low: tuple[float, ...]
-    action_high: tuple[float, ...]
-    state_size: int
-    physics_size: int
-    materials: int
-    max_steps: int
-    attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, task: Any) -> EpisodeShape:
-        """The shape of a `dmcvb_gen.tasks` task (which this package does not import)."""
-        return cls(
-            views=tuple(task.views),
-            goal=bool(task.goal_geoms),
-            state_fields={name: (part.start, part.stop) for name, part in task.state_slices.items()},
-            action_low=tuple(map(float, task.action_low)),
-            action_high=tuple(map(float, task.action_high)),
-            state_size=task.state_size,
-            physics_size=task.physics_size,
-            materials=len(task.material_colors),
-            max_steps=task.max_steps,
-            attributes=task.array_attributes,
-        )
-
-    @property
-    def rows(self) -> int:
-        """Rows of the step axis: one for each observation."""
-        return self.max_steps + 1
-
-
-def trajectory_arrays(shape: EpisodeShape) -> tuple[ArraySpec, ...]:
-    """The arrays of a set of trajectories."""
-    fields = {name: list(part) for name, part in shape.state_fields.items()}
-    bounds = {"low": list(shape.action_low), "high": list(shape.action_high)}
-    physics = dict(shape.attributes.get("physics", {}))
-    action = len(shape.action_low)
+def trajectory_arrays(task: Any) -> tuple[ArraySpec, ...]:
+    """The arrays of a set of trajectories of a `dmcvb_gen.tasks` task (which this package does not import)."""
+    fields = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
+    bounds = {"low": [*map(float, task.action_low)], "high": [*map(float, task.action_high)]}
+    physics = dict(task.array_attributes.get("physics", {}))
+    action = len(task.action_low)
     return (
         ArraySpec(
-            name="state", dtype="float32", shape=(shape.state_size,), dims=("state_dim",), attributes={"fields": fields}
+            name="state", dtype="float32", shape=(task.state_size,), dims=("state_dim",), attributes={"fields": fields}
         ),
         ArraySpec(name="action", dtype="float32", shape=(action,), dims=("action_dim",), attributes=bounds),
         ArraySpec(name="reward", dtype="float32"),
         ArraySpec(name="discount", dtype="float32"),
         ArraySpec(
-            name="physics", dtype="float64", shape=(shape.physics_size,), dims=("physics_dim",), attributes=physics
+            name="physics", dtype="float64", shape=(task.physics_size,), dims=("physics_dim",), attributes=physics
         ),
         ArraySpec(name="length", dtype="int32", steps=False),
         ArraySpec(name="terminated", dtype="bool", steps=False),
@@ -124,13 +75,13 @@ def trajectory_arrays(shape: EpisodeShape) -> tuple[ArraySpec, ...]:
     )
 
 
-def label_arrays(shape: EpisodeShape, varying: Collection[str] = ()) -> tuple[ArraySpec, ...]:
+def label_arrays(task: Any, varying: Collection[str] = ()) -> tuple[ArraySpec, ...]:
     """The arrays of a setting's labels, in the order of `DistractorState`.
 
     Args:
       varying: parts of the distractor that vary and have labels of their own, see `OPTIONAL_LABELS`.
     """
-    sizes = {"view": len(shape.views), "material": shape.materials, "xyz": 3, "wxyz": 4, "rgb": 3}
+    sizes = {"view": len(task.views), "material": len(task.material_colors), "xyz": 3, "wxyz": 4, "rgb": 3}
     return tuple(
         ArraySpec(
             name=f"exogenous/{name}",

@@ -50,8 +50,9 @@ class StepTable:
 
     Attributes:
       state: (row, state) float32. action: (row, action) float32. reward, discount: (row,) float32.
-      frames: (row, view * 3, size, size + 2 * border) uint8, each line with its mirrored border at both ends; None if
-        the table holds states alone.
+      frames: (row, look * view * 3, size, size + 2 * border) uint8, each line with its mirrored border at both ends;
+        None if the table holds states alone.
+      looks: settings that each row is seen under, see `Subset.looks`.
       lengths: (episode,) int64, transitions of each episode.
       episode, step: (row,) int64, the episode's index in its subset and the place in the episode.
       start, end: (row,) int64, first and last row of the row's episode.
@@ -65,6 +66,7 @@ class StepTable:
         frames: np.ndarray | None = None,
         episodes: np.ndarray | None = None,
         first: int = 0,
+        looks: int = 1,
     ):
         """Make a table of values that are in memory.
 
@@ -74,7 +76,7 @@ class StepTable:
           first: step of each episode's first row, for a window into an episode.
         """
         self.state, self.action, self.reward, self.discount = (fields[name] for name in FIELDS)
-        self.lengths, self.frames = lengths.astype(np.int64), frames
+        self.lengths, self.frames, self.looks = lengths.astype(np.int64), frames, looks
         rows, starts = lengths + 1, np.cumsum(lengths + 1) - (lengths + 1)
         self.start, self.end = np.repeat(starts, rows), np.repeat(starts + lengths, rows)
         self.episode = np.repeat(np.arange(len(rows)) if episodes is None else np.asarray(episodes, int), rows)
@@ -103,9 +105,9 @@ class StepTable:
         """
         lengths = [part.subset.read("length", part.episodes).clip(0, part.subset.record.max_steps) for part in parts]
         rows = int(sum((length + 1).sum() for length in lengths))
-        channels, size, frames = 3 * len(parts[0].pictures), parts[0].subset.record.size, None
-        if channels:
-            shape = (rows, channels, size, size + 2 * border)
+        looks, size, frames = parts[0].subset.looks, parts[0].subset.record.size, None
+        if parts[0].pictures:
+            shape = (rows, looks * 3 * len(parts[0].pictures), size, size + 2 * border)
             frames = np.empty(shape, np.uint8) if folder is None else _mapped(shape, Path(folder))
         values: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
         row = 0
@@ -123,7 +125,8 @@ class StepTable:
                 row = after
                 tick(row / max(1, rows))
         fields = {name: np.concatenate(found) for name, found in values.items()}
-        return cls(fields, np.concatenate(lengths), frames, np.concatenate([part.episodes for part in parts]))
+        episodes = np.concatenate([part.episodes for part in parts])
+        return cls(fields, np.concatenate(lengths), frames, episodes, looks=looks)
 
     @classmethod
     def window(cls, subset: Subset, episode: int, rows: slice, pictures: Sequence[str] = ()) -> StepTable:
@@ -131,9 +134,9 @@ class StepTable:
         read = {name: subset.array(name)[episode, rows] for name in (*FIELDS, *pictures)}
         count, size, frames = len(read["state"]), subset.record.size, None
         if pictures:
-            frames = np.empty((count, 3 * len(pictures), size, size), np.uint8)
+            frames = np.empty((count, subset.looks * 3 * len(pictures), size, size), np.uint8)
             _fill(frames, [read[name] for name in pictures])
-        return cls(read, np.array([count - 1]), frames, np.array([episode]), rows.start)
+        return cls(read, np.array([count - 1]), frames, np.array([episode]), rows.start, subset.looks)
 
     def __len__(self) -> int:
         """Transitions in the table."""
@@ -150,28 +153,35 @@ class StepTable:
         Returns:
           "state" (batch, state) float32, "pixels" (batch, stack * view * 3, height, width) uint8 with the oldest frame
           first, "action" (batch, action) float32, "reward" and "discount" (batch,) float32, "episode" and "step"
-          (batch,) int64; with `next_step` also "next_state" and "next_pixels".
+          (batch,) int64; with `next_step` also "next_state" and "next_pixels". Of several looks, "pixels" is
+          (batch, look, stack * view * 3, height, width).
         """
-        values = self._observe(rows, stack, "")
+        values = self.observe(rows, stack)
         values |= {name: getattr(self, name)[rows] for name in (*FIELDS[1:], "episode", "step")}
-        return values | self._observe(rows + 1, stack, "next_") if next_step else values
+        return values | self.observe(rows + 1, stack, "next_") if next_step else values
 
-    def _observe(self, rows: np.ndarray, stack: int, prefix: str) -> dict[str, np.ndarray]:
+    def observe(self, rows: np.ndarray, stack: int = 1, prefix: str = "") -> dict[str, np.ndarray]:
+        """State and pixels of some rows, see `gather`."""
         values = {f"{prefix}state": self.state[rows]}
         if self.frames is not None:
             stacks = np.maximum(rows[:, None] - np.arange(stack - 1, -1, -1), self.start[rows][:, None])
             _, channels, size, wide = self.frames.shape
             border = (wide - size) // 2
-            frames = self.frames[..., border : border + size][stacks]  # (batch, stack, channel, size, size)
-            values[f"{prefix}pixels"] = frames.reshape(len(rows), stack * channels, size, size)
+            frames = self.frames[..., border : border + size][stacks]  # (batch, stack, look * channel, size, size)
+            one, looks = channels // self.looks, [self.looks] * (self.looks > 1)
+            frames = frames.reshape(len(rows), stack, self.looks, one, size, size).swapaxes(1, 2)
+            values[f"{prefix}pixels"] = frames.reshape(len(rows), *looks, stack * one, size, size)
         return values
 
 
 def _fill(frames: np.ndarray, pictures: Sequence[np.ndarray], border: int = 0) -> None:
-    """Put pictures, (row, size, size, 3) a view, into (row, view * 3, size, size + 2 * border)."""
+    """Put pictures, (row, [look,] size, size, 3) a view, into (row, look * view * 3, size, size + 2 * border)."""
     inner = frames[..., border : border + frames.shape[2]]
     for view, picture in enumerate(pictures):
-        inner[:, 3 * view : 3 * view + 3] = picture.transpose(0, 3, 1, 2)
+        looks = picture if picture.ndim == 5 else picture[:, None]
+        for look in range(looks.shape[1]):
+            first = 3 * (look * len(pictures) + view)
+            inner[:, first : first + 3] = looks[:, look].transpose(0, 3, 1, 2)
     if border:
         frames[..., :border], frames[..., -border:] = inner[..., :border][..., ::-1], inner[..., -border:][..., ::-1]
 

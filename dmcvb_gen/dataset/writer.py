@@ -42,7 +42,7 @@ from dmcvb_gen.dataset.manifest import (
     check_record,
     list_path,
     merged_layers,
-    merged_subset,
+    merged_subsets,
     parse,
     record_bytes_limit,
     record_path,
@@ -132,11 +132,7 @@ def check_agree(recipes: Iterable[Resolved]) -> None:
     """Raises StoreError if recipes describe a layer or a subset differently."""
     recipes = list(recipes)
     merged_layers(recipes)
-    subsets: dict[str, SubsetRecord] = {}
-    for recipe in recipes:
-        for subset in recipe.subsets:
-            there = subsets.get(subset.name)
-            subsets[subset.name] = subset if there is None else merged_subset(there, subset)
+    merged_subsets(subset for recipe in recipes for subset in recipe.subsets)
 
 
 # -- shards ---------------------------------------------------------------------------------------

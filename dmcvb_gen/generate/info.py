@@ -28,16 +28,20 @@ def return_statistics(returns: np.ndarray) -> dict[str, float]:
 def describe_release(path: str | Path, storage_options: dict | None = None) -> dict[str, Any]:
     """Subsets of a release with episodes, steps, bytes and returns, the paper's row beside each.
 
+    "normalized" is the mean return where the release's random actions have 0 and its expert 100; else None.
     "missing" names the subsets of which nothing is here, and how many episodes they are to have.
 
     Raises:
       StoreError: there is no release at `path`.
     """
     from dmcvb_gen.dataset.gate import Release  # loads zarr, which `list` needs not
+    from dmcvb_gen.generate.references import normalized, reference_returns
 
     release = Release.open(path, storage_options)
     subsets = []
     for name, subset in release.subsets.items():
+        references = reference_returns(release, subset.record, simulated=False)
+        returns = return_statistics(subset.returns)
         subsets.append(
             dict(
                 name=name,
@@ -50,7 +54,8 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 size=subset.record.size,
                 images=any(layer.kind == "images" for layer in subset.layers),
                 renderer=subset.record.renderer.get("name"),
-                returns=return_statistics(subset.returns),
+                returns=returns,
+                normalized=normalized(returns["mean"], references),
                 other_length=subset.record.max_steps * subset.record.action_repeat != PAPER_STEPS[is_maze(subset.task)],
                 paper=None if subset.setting == FIXED else paper_returns(subset.task, subset.level),
             )

@@ -30,7 +30,7 @@ from dmcvb_gen.dataset.manifest import (
     shard_size,
 )
 from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
-from dmcvb_gen.dataset.schema import EpisodeShape, image_array, label_arrays, trajectory_arrays
+from dmcvb_gen.dataset.schema import image_array, label_arrays, trajectory_arrays
 from dmcvb_gen.distractor_state import OPTIONAL_LABELS
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, RecipeError
@@ -176,8 +176,6 @@ def _episodes_per_shard(name: str, members: Sequence[SubsetRequest], there: Rele
 
 def _layers(recipe: Recipe, record: SubsetRecord, name: str, per_shard: int, pixels: bool) -> list[Layer]:
     """The layers of a subset: trajectories, labels, images."""
-    task = get_task(record.task)
-    shape = EpisodeShape.of(task)
     streams = [record.task, record.level] + ([record.setting] if name == record.name else [])
     makes = {
         "task": record.task,
@@ -196,7 +194,7 @@ def _layers(recipe: Recipe, record: SubsetRecord, name: str, per_shard: int, pix
         kind="trajectories",
         rows=record.max_steps + 1,
         episodes_per_shard=per_shard,
-        arrays=trajectory_arrays(shape),
+        arrays=trajectory_arrays(get_task(record.task)),
         makes=makes,
     )
     labels = labels_layer(record, trajectories)
@@ -213,7 +211,7 @@ def labels_layer(record: SubsetRecord, trajectories: Layer) -> Layer:
         kind="labels",
         rows=trajectories.rows,
         episodes_per_shard=trajectories.episodes_per_shard,
-        arrays=label_arrays(EpisodeShape.of(get_task(record.task)), varying),
+        arrays=label_arrays(get_task(record.task), varying),
         makes={
             "of": trajectories.key,
             "distractor": record.distractor.name,

@@ -1,4 +1,4 @@
-"""Readers: releases for training (xarray, torch, numpy) and environments for evaluation (Gymnasium, dm_env).
+"""Readers: releases for training (xarray, torch, numpy) and environments for evaluation (Gymnasium).
 
 Everything is imported when first asked for: `import dmcvb_gen` passes here, and must stay quick.
 """
@@ -11,6 +11,9 @@ from typing import Any
 _HOMES = {
     "ReleaseReader": "release",
     "SubsetReader": "release",
+    "UnionReader": "union",
+    "PairedReader": "paired",
+    "evaluate_invariance": "invariance",
     "open_for_reading": "release",
     "StepSource": "sampler",
     "EpisodeDataset": "torch_data",
@@ -19,7 +22,7 @@ _HOMES = {
     "DistractedEnv": "envs",
     "DistractedVectorEnv": "envs",
     "data_layout": "layout",
-    "DmEnv": "dm",
+    "matching_environment": "layout",
 }
 
 __all__ = sorted(_HOMES)

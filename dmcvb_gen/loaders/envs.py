@@ -324,10 +324,6 @@ class DistractedEnv(gymnasium.Env):
         self._ended = False
         self._pixels: np.ndarray | None = None
 
-    def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
-        """Spaces of observations {"pixels", "state"}, and of actions."""
-        return self._stage.spaces()
-
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
         super().reset(seed=seed)
         if seed is not None or self._seed is None:

@@ -1,7 +1,8 @@
 """Environments that show what the data show: stacks of frames, channels first.
 
 A policy trained on `sampler.stream` or a `StepSource` sees the same layout here: the last `stack` frames, oldest first,
-each with its views in their order, and the first frame of an episode repeated before it.
+each with its views in their order, and the first frame of an episode repeated before it. `subset.environment()` makes
+the environment that matches a subset.
 """
 
 from __future__ import annotations
@@ -14,7 +15,13 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.inputs import BUILTIN, video_source
+from dmcvb_gen.loaders.envs import DistractedEnv, DistractedVectorEnv
+from dmcvb_gen.spec import FIXED, HIDDEN, VISIBLE
+from dmcvb_gen.tasks import ACTION_REPEAT
 
 
 class _Stack:
@@ -105,3 +112,54 @@ class VectorDataLayout(VectorWrapper):
 def data_layout(env: gymnasium.Env | VectorEnv, stack: int = 3) -> DataLayout | VectorDataLayout:
     """An environment of `gymnasium.make` or `make_vec` with the data's layout (the agents' of DMC-VB with 3 frames)."""
     return VectorDataLayout(env, stack) if isinstance(env, VectorEnv) else DataLayout(env, stack)
+
+
+def matching_environment(
+    subset: Subset, stack: int = 3, split: str = "val", num_envs: int | None = None, **options: Any
+) -> DataLayout | VectorDataLayout:
+    """See `SubsetReader.environment`."""
+    given = environment_options(subset, split)
+    if own_videos(subset):
+        given["backgrounds"] = video_source(subset.release.path, subset.record)
+    given |= options
+    env = DistractedEnv(**given) if num_envs is None else DistractedVectorEnv(num_envs, **given)
+    return data_layout(env, stack)
+
+
+def environment_options(subset: Subset, split: str) -> dict[str, Any]:
+    """Options of `DistractedEnv` that match a subset: setting, size, renderer, views, time limit, pairs of goals.
+
+    Episodes are cut where the data's are, and so compare with the reference scores.
+
+    Args:
+      split: videos and styles: the data's own ("train"), or those kept for evaluation ("val").
+    """
+    record, maze = subset.record, subset.record.goal_mode is not None
+    options: dict[str, Any] = {
+        "task": record.task,
+        "distractor": record.setting if maze else record.distractor.name,
+        "size": record.size,
+        "samples": record.renderer.get("samples"),
+        "split": split,
+        "max_steps": record.max_steps,
+    }
+    if record.action_repeat != ACTION_REPEAT:
+        options["action_repeat"] = record.action_repeat
+    if record.renderer.get("name") and not record.imported:
+        options["renderer"] = record.renderer["name"]
+    if maze:
+        options["views"] = list(shown(subset).views)
+        if record.hidden_goal != (record.setting != VISIBLE):  # `paint --goal` decides it, too
+            options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
+    if own_videos(subset):
+        options["own_videos"] = (record.backgrounds or {}).get("digest")
+    if record.setting == FIXED:
+        seed = int(subset.trajectories.makes.get("seed", 0))
+        options |= {"fixed_goals": record.fixed_goals, "goal_seed": seed}
+    return options
+
+
+def own_videos(subset: Subset) -> str | None:
+    """The folder of a release's own videos; None if a subset shows the built-in ones or none."""
+    videos = (subset.record.backgrounds or {}).get("source", BUILTIN)
+    return None if videos == BUILTIN else videos

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,17 @@ import numpy as np
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_of
-from dmcvb_gen.dataset.reader import StoredArray, without_ellipsis
+from dmcvb_gen.dataset.reader import StoredArray
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
 from dmcvb_gen.generate.resolve import all_pictures, stream_names
+from dmcvb_gen.loaders.arrays import ComputedArray
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.text import quoted
 
 STORED, RESAMPLED = "stored", "resample"
 DISTRACTORS = (STORED, RESAMPLED)
@@ -66,51 +66,17 @@ class Painting:
             check_size(self.size)
 
 
-class ComputedArray:
-    """An array that is computed an episode at a time when it is indexed; see `dataset.reader.StoredArray`.
-
-    Args:
-      compute: gives an episode's values, of `shape[1:]`.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        shape: tuple[int, ...],
-        dtype: np.dtype,
-        dimensions: tuple[str, ...],
-        compute: Callable[[int], np.ndarray],
-    ):
-        self.name, self.shape, self.dtype, self.dimensions = name, shape, dtype, dimensions
-        self.ndim, self._compute = len(shape), compute
-
-    def __getitem__(self, selection: Any) -> np.ndarray:
-        first, *rest = without_ellipsis(selection, self.ndim)
-        episodes = np.arange(self.shape[0])[first]
-        if np.ndim(episodes) == 0:
-            return self._compute(int(episodes))[tuple(rest)]
-        return self.rows(np.asarray(episodes))[(slice(None), *rest)]
-
-    def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
-        """(episode, row, ...) values, rows past an episode's end zero."""
-        values = [self._compute(int(episode))[:rows] for episode in episodes]
-        return np.stack(values) if values else np.zeros((0, *self.shape[1:]), self.dtype)[:, :rows]
-
-
 class PaintedSubset(SubsetReader):
     """A subset whose pictures are rendered when they are read. With fresh distractors, each epoch shows others.
 
     Labels are those of the pictures. Stored depth, segmentation, parts and flow are of the stored distractors and size,
     so they are only read with these.
-
-    Attributes:
-      epoch: epoch of the distractors; 0 at the start.
     """
 
     def __init__(self, release: Release, record: SubsetRecord, painting: Painting):
         # What is stored may be of another size, or without pictures; this subset says what can be read of it.
         super().__init__(release, record.model_copy(update={"size": painting.size or record.size}))
-        self.painting, self.epoch = painting, 0
+        self.painting, self.fresh = painting, painting.distractors == RESAMPLED
         self._other_frames = self.fresh or self.record.size != record.size
         self._start()
 
@@ -121,37 +87,12 @@ class PaintedSubset(SubsetReader):
         self._bytes, self._lock = 0, threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:  # painters and what they painted stay where they are
-        names = ("painting", "epoch", "_other_frames")
-        return super().__getstate__() | {name: getattr(self, name) for name in names}
+        made = ("_kept", "_drawn", "_painter", "_bytes", "_lock")
+        return {name: value for name, value in super().__getstate__().items() if name not in made}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._start()
-
-    def xarray(self, episodes: Iterable[int] | None = None) -> Any:
-        """Refused: xarray shows what is stored.
-
-        Raises:
-          StoreError: always.
-        """
-        raise StoreError(
-            f"xarray shows what is stored of {self.name}, and paints nothing; open the release without paint=True, or "
-            f"paint it first: dmcvb-gen paint {quoted(self.release.place)}"
-        )
-
-    def set_epoch(self, epoch: int) -> None:
-        """Draw the distractors of another epoch from now on (if they are fresh)."""
-        self.epoch = epoch
-
-    @property
-    def fresh(self) -> bool:
-        """True if each epoch shows other distractors."""
-        return self.painting.distractors == RESAMPLED
-
-    @property
-    def shown_epoch(self) -> int:
-        """The epoch whose distractors the pictures show; 0 if they are those of the data."""
-        return self.epoch if self.fresh else 0
 
     @property
     def picture_names(self) -> tuple[str, ...]:
@@ -177,7 +118,9 @@ class PaintedSubset(SubsetReader):
         if picture_of(name) is not None:
             record, axes = self.record, ("episode", "step", "height", "width", "channel")
             shape = (record.episodes, record.max_steps + 1, record.size, record.size, 3)
-            return ComputedArray(name, shape, np.dtype(np.uint8), axes, lambda e: self.painted(e, [name])[name])
+            return ComputedArray(
+                name, shape, np.dtype(np.uint8), axes, lambda e, rest: self.painted(e, [name])[name][rest]
+            )
         if self._other_frames and stored_in([name]):
             raise StoreError(
                 f"the stored {name} of {self.name} belongs to the images as they were made, not to those with "
@@ -188,7 +131,11 @@ class PaintedSubset(SubsetReader):
             return stored
         label = name.removeprefix("exogenous/")
         return ComputedArray(
-            name, stored.shape, stored.dtype, stored.dimensions, lambda e: self._shown_label(e, label, stored)
+            name,
+            stored.shape,
+            stored.dtype,
+            stored.dimensions,
+            lambda e, rest: self._shown_label(e, label, stored)[rest],
         )
 
     def _shown_label(self, episode: int, label: str, stored: StoredArray) -> np.ndarray:
@@ -233,7 +180,7 @@ class PaintedSubset(SubsetReader):
           StoreError: there is no such episode here.
         """
         self._check_episode(episode)
-        epoch = self.shown_epoch
+        epoch = self.epoch
         keys = {name: (episode, epoch, name) for name in (self.picture_names if arrays is None else arrays)}
         with self._lock:
             found = {name: self._kept[key] for name, key in keys.items() if key in self._kept}

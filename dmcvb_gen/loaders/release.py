@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+import importlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
+from dmcvb_gen import loaders
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.reader import Subset
@@ -25,6 +30,26 @@ class SubsetReader(Subset):
     def __getitem__(self, index: int) -> dict[str, Any]:
         """The arrays of the `index`-th episode that is here, see `episode`; negative ones count from the end."""
         return self.episode(int(self._episodes[index]))
+
+    def part(self, episodes: Iterable[int]) -> Self:
+        """The same subset with some of its episodes alone: indices, or a mask such as `subset.returns > 900`."""
+        chosen = copy.copy(self)
+        for name in ("lengths", "returns"):
+            chosen.__dict__.pop(name, None)
+        chosen.__dict__["_episodes"] = np.unique(self.choose(episodes))
+        return chosen
+
+    def paired(self, *settings: str) -> Any:
+        """The same states under several settings: `subset.paired("none", "static")` is a `PairedReader`.
+
+        It reads as a subset does; "pixels" of its batches are (batch, setting, stack * view * 3, height, width). Images
+        that the release stores of these states are read. A setting of which it stores none, or that is named twice, is
+        rendered on reading, with fresh distractors, others for each `set_epoch`.
+
+        Raises:
+          DmcvbError: no such setting of this task, or the data were imported and the release does not hold it.
+        """
+        return loaders.PairedReader(self, settings)
 
     def xarray(self, episodes: Iterable[int] | None = None) -> xarray.Dataset:
         """All arrays as one lazy xarray data set.
@@ -68,6 +93,26 @@ class SubsetReader(Subset):
             options["next_step"] = True
         return kinds[kind](self, **options)
 
+    def environment(self, **options: Any) -> Any:
+        """The environment that matches the data: size, renderer, views, videos and time limit, with stacked frames.
+
+        Args:
+          options: stack (3) frames; split ("val"): "val" shows videos and styles that no data show, "train" the data's;
+            num_envs: a vector environment; and those of `DistractedEnv`.
+        """
+        return loaders.matching_environment(self, **options)
+
+    def evaluate(self, policy: Any, **options: Any) -> Any:
+        """Score a policy on fresh episodes like the data's; see `dmcvb_gen.evaluate`, which takes a subset, too.
+
+        Args:
+          options: split ("val"), episodes (30), seed (0), stack (3), ...
+
+        Returns:
+          A `Score`; its `normalized` is 0 for random actions and 100 for the data's expert.
+        """
+        return importlib.import_module("dmcvb_gen").evaluate(policy, self, **options)  # of a floor above this one
+
     def source(self, **options: Any) -> StepSource:
         """Any step at random, numpy alone: for Grain, tf.data or torch; `options` as for `StepSource`."""
         return StepSource(self, **options)
@@ -84,7 +129,20 @@ class ReleaseReader(Release):
         return SubsetReader(self, record)
 
     def __getitem__(self, name: str) -> SubsetReader:
-        return super().__getitem__(name)
+        parts = self.parts_of(name)
+        return self.union(*parts) if parts else super().__getitem__(name)
+
+    def union(self, *names: str) -> SubsetReader:
+        """Subsets that differ in level, read as one.
+
+        `release.union("walker-walk/medium/none", "walker-walk/expert/none")` is medium-expert of D4RL and V-D4RL, and
+        `release["walker-walk/medium-expert/none"]` is the same. Episodes are numbered through: those of the second
+        subset come after all that the first one will have.
+
+        Raises:
+          DmcvbError: they differ in task, setting, size or time limit, or have no episodes here.
+        """
+        return loaders.UnionReader(self, [self[name] for name in names])
 
 
 def open_for_reading(path: str | Path, storage_options: dict | None = None, digest: str | None = None) -> ReleaseReader:

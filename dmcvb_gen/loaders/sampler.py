@@ -77,9 +77,9 @@ class StepSource:
         lengths = subset.read("length", self.episodes)
         self._ends = np.cumsum(lengths)
         if in_memory is None:
-            size = int(np.sum(lengths + 1)) * len(self.pictures) * subset.record.size**2 * 3
+            size = int(np.sum(lengths + 1)) * len(self.pictures) * subset.record.size**2 * 3 * subset.looks
             # Of fresh distractors, each of a loader's workers paints and holds its own.
-            holders = 1 + usable_cores() if getattr(subset, "fresh", False) else 1
+            holders = 1 + usable_cores() if subset.fresh else 1
             in_memory = size <= SHARE_OF_MEMORY * (free_memory() or UNKNOWN_MEMORY) / holders
         self.in_memory = in_memory
         self._held: tuple[int, StepTable] | None = None
@@ -111,7 +111,7 @@ class StepSource:
     def table(self) -> StepTable:
         """All steps, in memory; read again if the subset's distractors have become those of another epoch."""
         with self._reading:
-            epoch = getattr(self.subset, "shown_epoch", 0)
+            epoch = self.subset.epoch
             if self._held is None or self._held[0] != epoch:
                 self._held = None  # free the old pictures before new ones are painted
                 self._held = epoch, StepTable.read([Selection(self.subset, self.episodes, self.pictures)])

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
@@ -49,8 +50,8 @@ class _OfEpoch:
         the subset. A pass that has begun keeps the epoch that was given before it.
         """
         epoch = int(self._epoch) if epoch is None else epoch
-        if epoch >= 0 and getattr(self.subset, "epoch", epoch) != epoch:
-            self.subset.set_epoch(epoch)  # type: ignore[attr-defined]
+        if epoch >= 0:
+            self.subset.set_epoch(epoch)
 
 
 class StepDataset(_OfEpoch, Dataset):
@@ -101,8 +102,7 @@ class EpisodeDataset(_OfEpoch, Dataset):
         episode = self.episodes[index]
         table = StepTable.read([Selection(self.subset, self.episodes[[index]], self.pictures)])
         values = {name: getattr(table, name)[: len(table)] for name in ("action", "reward", "discount")}
-        values |= {"state": table.state, "episode": episode}
-        return _tensors(values if table.frames is None else values | {"pixels": table.frames})
+        return _tensors(values | table.observe(np.arange(len(table.state))) | {"episode": episode})
 
 
 class StreamDataset(_OfEpoch, IterableDataset):

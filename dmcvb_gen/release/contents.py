@@ -12,7 +12,7 @@ import numpy as np
 
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.reader import Subset
-from dmcvb_gen.dataset.schema import EpisodeShape, trajectory_arrays
+from dmcvb_gen.dataset.schema import trajectory_arrays
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.generate.inputs import local_inputs, video_source
@@ -60,7 +60,7 @@ def _sample(count: int, wanted: int) -> np.ndarray:
 def check_values(subset: Subset) -> Iterator[Issue]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task).at(subset.record.action_repeat)
-    for spec in trajectory_arrays(EpisodeShape.of(task)):
+    for spec in trajectory_arrays(task):
         if spec.name == "physics" and subset.record.imported:
             continue
         if spec.name not in subset.arrays:

@@ -19,7 +19,7 @@ from PIL import Image
 from dmcvb_gen.dataset.gate import Release, recorded_shards
 from dmcvb_gen.dataset.manifest import IMPORTED, MAX_STEPS, Layer, Resolved, SubsetRecord, shard_size
 from dmcvb_gen.dataset.pictures import picture_arrays
-from dmcvb_gen.dataset.schema import EpisodeShape, image_array, trajectory_arrays
+from dmcvb_gen.dataset.schema import image_array, trajectory_arrays
 from dmcvb_gen.dataset.writer import begin, finish, put_shard, write_provenance
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
@@ -133,10 +133,9 @@ def import_tfds(
 def _layers(source: _Source) -> list[Layer]:
     """The layers of an imported subset: trajectories, then the images of each view, with the goal or without it."""
     record, facts = source.record, source.facts
-    shape = EpisodeShape.of(get_task(record.task))
     rows, per_shard = record.max_steps + 1, shard_size(record.episodes, DEFAULT_EPISODES_PER_SHARD[record.family])
     given: dict[str, Any] = dict(rows=rows, episodes_per_shard=per_shard, makes=facts, source=ORIGIN)
-    arrays = tuple(spec for spec in trajectory_arrays(shape) if spec.name != "physics")
+    arrays = tuple(spec for spec in trajectory_arrays(get_task(record.task)) if spec.name != "physics")
     group = f"{record.name}.zarr"
     layers = [
         Layer(

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from types import SimpleNamespace
 
 import numpy as np
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import Layer, Resolved, SubsetRecord, record_path
-from dmcvb_gen.dataset.schema import EpisodeShape, image_array, label_arrays, trajectory_arrays
+from dmcvb_gen.dataset.schema import image_array, label_arrays, trajectory_arrays
 from dmcvb_gen.dataset.writer import begin, finish, put_shard
 from dmcvb_gen.storage.store import Store
 
 PER_SHARD, MAX_STEPS, SIZE = 2, 5, 4
-SHAPE = EpisodeShape(("pixels",), False, {"a": (0, 2)}, (-1.0, -1.0), (1.0, 1.0), 2, 3, 1, MAX_STEPS)
+TASK = SimpleNamespace(
+    views=("pixels",),
+    state_slices={"a": slice(0, 2)},
+    state_size=2,
+    action_low=(-1.0, -1.0),
+    action_high=(1.0, 1.0),
+    physics_size=3,
+    material_colors=((0, 0, 0),),
+    array_attributes={},
+)
 
 
 def _layer(name: str, group: str, kind: str, arrays: Sequence, **makes: object) -> Layer:
@@ -29,7 +39,7 @@ TRAJECTORIES = _layer(
     "hop/random/trajectories",
     "hop/random.zarr/trajectories",
     "trajectories",
-    [spec for spec in trajectory_arrays(SHAPE) if spec.name in KEPT],
+    [spec for spec in trajectory_arrays(TASK) if spec.name in KEPT],
     seed=1,
 )
 
@@ -37,7 +47,7 @@ TRAJECTORIES = _layer(
 def setting_layers(setting: str, **makes: object) -> tuple[Layer, Layer]:
     """Labels and images of a setting."""
     name, group = f"hop/random/{setting}", f"hop/random.zarr/{setting}"
-    arrays = [spec for spec in label_arrays(SHAPE) if spec.name in KEPT]
+    arrays = [spec for spec in label_arrays(TASK) if spec.name in KEPT]
     labels = _layer(f"{name}/labels", group, "labels", arrays, of=TRAJECTORIES.key, setting=setting)
     image = image_array("pixels", SIZE, setting == "dynamic", MAX_STEPS + 1)
     return labels, _layer(f"{name}/pixels", group, "images", [image], of=labels.key, **makes)

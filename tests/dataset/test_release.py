@@ -9,8 +9,6 @@ import pickle
 
 import numpy as np
 import pytest
-import xarray
-import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -59,20 +57,6 @@ def test_readers_get_the_values_that_were_written(store):
     assert set(episodes) == {0, 1, 2}
     for index, episode in episodes.items():
         assert all((value == subset.episode(index)[name]).all() for name, value in episode.items())
-
-
-def test_plain_readers_see_all_arrays(store):
-    subset = made_up.make(store, made_up.recipe(3))[NAME]
-    place = str(store.folder / "hop/random.zarr")
-    tree = xarray.open_datatree(place, engine="zarr")
-    np.testing.assert_array_equal(tree["dynamic/pixels"].values, subset.read("pixels"))
-    np.testing.assert_array_equal(tree["trajectories/state"].values, subset.read("state"))
-    group = zarr.open_group(place, mode="r")
-    np.testing.assert_array_equal(
-        group["none/exogenous/style"][:], subset.release["hop/random/none"].read("exogenous/style")
-    )
-    joined = xarray.merge([tree["trajectories"].to_dataset(), tree["dynamic"].to_dataset()])
-    assert {"state", "pixels"} <= set(joined)
 
 
 def test_readers_take_no_notice_of_zarr_metadata(store):
@@ -237,15 +221,6 @@ def test_a_copy_has_the_digest_of_what_it_was_copied_from(store, tmp_path):
     with pytest.raises(StoreError, match="2..3"):
         made["hop/random/none"].array("state")[:]
     assert finish(copy).digest == release.digest
-
-
-def test_a_digest_from_outside_is_compared(store):
-    digest = made_up.make(store, made_up.recipe(2)).digest
-    assert not Release.open(store).compared
-    assert Release.open(store, digest=digest).compared
-    assert Release.open(f"{store.folder}@sha256:{digest}").compared
-    with pytest.raises(StoreError, match=digest):
-        Release.open(store, digest="0" * 64)
 
 
 def test_a_release_is_not_resumed_with_other_versions(store, monkeypatch):

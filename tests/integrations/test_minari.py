@@ -11,8 +11,8 @@ from typer.testing import CliRunner as TyperRunner
 
 import dmcvb_gen
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.references import reference_returns
 from dmcvb_gen.release.export import export
-from dmcvb_gen.release.export.references import reference_returns
 from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
 
@@ -97,15 +97,16 @@ def test_references_are_of_episodes_as_long_as_the_datas(maze_release, tmp_path)
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "short")
     release = dmcvb_gen.open(str(tmp_path / "short"))
     record = release["walker-walk/random/none"].record
-    assert reference_returns(release, record) == {}  # the package's expert was measured over 500 steps
+    assert reference_returns(release, record) is None  # the package's expert was measured over 500 steps
     expert = record.model_copy(update={"level": "expert"})
     release.subsets["x"] = type(release["walker-walk/random/none"])(release, expert)
     release.subsets["x"].__dict__["returns"] = np.array([15.0])
-    found = reference_returns(release, record)
-    assert found["ref_max_score"] == 15 and 0 < found["ref_min_score"] < 10
+    low, high = reference_returns(release, record)
+    assert high == 15 and 0 < low < 10
+    assert reference_returns(release, record.model_copy(update={"return_range": (1.0, 3.0)})) == (1, 3)
     mazes = dmcvb_gen.open(str(maze_release))
     whole = mazes["ant-maze-tiny/random/visible"].record
-    assert whole.max_steps == get_task(whole.task).max_steps and reference_returns(mazes, whole) == {}  # no expert
+    assert whole.max_steps == get_task(whole.task).max_steps and reference_returns(mazes, whole) is None  # no expert
 
 
 def test_scores_are_normalized_between_random_and_expert(datasets):

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, sha256_bytes, write_json
-from dmcvb_gen.loaders.release import open_for_reading
+from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import all_formats, get_format
@@ -93,8 +92,10 @@ def export(
     release = open_for_reading(path, storage_options)
     if not is_url(str(path)) and Path(path).resolve() in (out.resolve(), *out.resolve().parents):
         raise StoreError(f"--out {out} lies in the release itself; give another folder")
-    names = release.select(list(only))
-    chosen = tuple((name, _episodes(release, name, episodes)) for name in names)
+    unions = [name for name in only if release.parts_of(name)]
+    others = [name for name in only if name not in unions]
+    names = [*(release.select(others) if others or not unions else ()), *unions]
+    chosen = tuple((name, _episodes(release[name], episodes)) for name in names)
     folders = [out] if merge else [out / kind.folder_name(release, name) for name in names]
     works = [
         _Work(str(path), storage_options, to, options, part, folder, _stamp(release, to, options, part))
@@ -110,11 +111,11 @@ def export(
     return folders
 
 
-def _stamp(release: Release, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
+def _stamp(release: ReleaseReader, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
     """What an export was made from: release, format, options, and the records of the shards that it reads."""
     content = []
     for name, episodes in subsets:
-        shards = release.shards([name], (episodes[0], episodes[-1] + 1))
+        shards = release[name].shards((episodes[0], episodes[-1] + 1))
         digest = sha256_bytes(b"".join(canonical_json(shard.record) for shard in shards))
         content.append([name, digest, list(episodes)])
     return dict(release=release.manifest.name, format=to, options=options, subsets=content)
@@ -124,14 +125,13 @@ def _formats_with(option: str) -> list[str]:
     return [name for name, kind in all_formats().items() if option in kind.options]
 
 
-def _episodes(release: Release, name: str, asked: tuple[int, int] | None) -> tuple[int, ...]:
+def _episodes(subset: SubsetReader, asked: tuple[int, int] | None) -> tuple[int, ...]:
     """The episodes of a subset that are exported; all that are asked for must be there."""
-    record = next(record for record in release.manifest.subsets if record.name == name)
-    here = set(release.subsets[name].episodes.tolist()) if name in release.subsets else set()
-    first, last = asked or (0, record.episodes)
-    wanted = range(max(first, 0), min(last, record.episodes))
+    name, count, here = subset.name, subset.record.episodes, set(subset.episodes.tolist())
+    first, last = asked or (0, count)
+    wanted = range(max(first, 0), min(last, count))
     if not wanted:
-        raise StoreError(f"{name} has none of the episodes {first}:{last}; it has {record.episodes}")
+        raise StoreError(f"{name} has none of the episodes {first}:{last}; it has {count}")
     missing = [episode for episode in wanted if episode not in here]
     if missing:
         raise StoreError(

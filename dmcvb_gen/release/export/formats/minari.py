@@ -15,8 +15,6 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.registry import register_exporter
-from dmcvb_gen.spec import FIXED, HIDDEN, VISIBLE
-from dmcvb_gen.tasks import ACTION_REPEAT
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
@@ -48,7 +46,7 @@ def write(source: Source, folder: Path) -> None:
     from gymnasium import spaces
     from minari.dataset.minari_storage import MinariStorage
 
-    from dmcvb_gen.release.export.references import reference_returns
+    from dmcvb_gen.generate.references import reference_returns
 
     subset, size = source.subset, source.subset.record.size
     name = folder_name(source.release, subset.name)
@@ -72,8 +70,9 @@ def write(source: Source, folder: Path) -> None:
         "description": source.description + _about_videos(source),
         "requirements": [f"dmcvb-gen>={__version__}"],
         "eval_env_spec": _environment(source, "val").to_json(),
-        **reference_returns(source.release, subset.record),
     }
+    if references := reference_returns(source.release, subset.record):
+        facts |= {"ref_min_score": references[0], "ref_max_score": references[1]}
     storage.update_metadata(facts)
     storage.update_episodes(_buffer(number, episode) for number, episode in enumerate(source))
     storage.update_metadata({"dataset_size": storage.get_size()})
@@ -91,32 +90,11 @@ def _environment(source: Source, split: str) -> EnvSpec:
     import gymnasium
     from gymnasium.envs.registration import EnvSpec
 
+    from dmcvb_gen.loaders.layout import environment_options
+
     record = source.subset.record
-    maze = record.goal_mode is not None
-    setting = record.setting if maze else record.distractor.kind
-    options = {
-        "task": record.task,
-        "distractor": record.setting if maze else record.distractor.name,
-        "size": record.size,
-        "samples": record.renderer.get("samples"),
-        "split": split,
-    }
-    if record.renderer.get("name") and not record.imported:
-        options["renderer"] = record.renderer["name"]
-    if maze:
-        options["views"] = list(source.views)
-        if record.hidden_goal != record.spec.hides_goal:  # `paint --goal` decides it, too
-            options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
-    options["max_steps"] = record.max_steps
-    if record.action_repeat != ACTION_REPEAT:
-        options["action_repeat"] = record.action_repeat
-    if _own_videos(source):
-        options["own_videos"] = (record.backgrounds or {}).get("digest")
-    if record.setting == FIXED:
-        options |= {
-            "fixed_goals": record.fixed_goals,
-            "goal_seed": int(source.subset.trajectories.makes.get("seed", 0)),
-        }
+    setting = record.setting if record.goal_mode else record.distractor.kind
+    options = environment_options(source.subset, split)
     name = environment_id(record.name.split("/")[0], setting)
     registered = gymnasium.registry.get(name)
     spec = EnvSpec(name, entry_point=registered.entry_point if registered else ENTRY_POINT, kwargs=options)
@@ -124,17 +102,11 @@ def _environment(source: Source, split: str) -> EnvSpec:
     return spec
 
 
-def _own_videos(source: Source) -> str | None:
-    """Return the folder of the release's own videos; None if it shows the built-in ones or none."""
-    from dmcvb_gen.generate.inputs import BUILTIN
-
-    videos = (source.subset.record.backgrounds or {}).get("source", BUILTIN)
-    return None if videos == BUILTIN else videos
-
-
 def _about_videos(source: Source) -> str:
     """A sentence about videos that the package does not bring, without their folder on this machine."""
-    videos = _own_videos(source)
+    from dmcvb_gen.loaders.layout import own_videos
+
+    videos = own_videos(source.subset)
     return f"; with its videos: recover_environment(backgrounds=FOLDER), the release's {videos}" if videos else ""
 
 

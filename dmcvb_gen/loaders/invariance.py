@@ -1,0 +1,102 @@
+"""Measure what an encoder keeps: the state, or what distracts from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.loaders.paired import PairedReader
+
+ENCODED = 64
+"""Images that an encoder gets at a time."""
+RIDGE = 1e-3
+"""Weight of the squared coefficients of a probe, a sample."""
+
+
+@dataclass(frozen=True)
+class Invariance:
+    """How an encoder takes images of the same states under several settings.
+
+    Attributes:
+      retrieval: share of images whose nearest image under another setting, of all `states` of them, shows the same
+        state: 1 for an encoder that sees nothing but the state.
+      chance: `retrieval` of an encoder that sees nothing.
+      state: R2 of a linear probe of the state on episodes that it did not learn from; 1 is perfect, 0 or less nothing.
+      distractors: R2 of a linear probe of the distractors' real-valued labels; NaN if they never differ.
+    """
+
+    retrieval: float
+    chance: float
+    state: float
+    distractors: float
+
+
+def evaluate_invariance(
+    pairs: PairedReader,
+    encoder: Callable[[np.ndarray], Any],
+    *,
+    states: int = 512,
+    episodes: int = 16,
+    seed: int = 0,
+    **options: Any,
+) -> Invariance:
+    """See `PairedReader.evaluate_invariance`."""
+    if len(pairs) < 2:
+        raise DmcvbError(f"{pairs.name} has {len(pairs)} episodes; a probe needs 2, to learn from and to be tested on")
+    rng = np.random.default_rng(seed)
+    chosen = np.sort(rng.permutation(pairs.episodes)[:episodes])
+    source = pairs.source(episodes=chosen, in_memory=True, **options)
+    batch = source.gather(np.sort(rng.permutation(len(source))[:states]))
+    count, tested = len(batch["step"]), np.isin(batch["episode"], chosen[1::2])
+    features = [_encoded(encoder, batch["pixels"][:, look]) for look in range(pairs.looks)]
+    scaled = np.split(_scaled(np.concatenate(features)), pairs.looks)
+    places = np.searchsorted(chosen, batch["episode"]), batch["step"]
+    labels = [_real(part.labels(chosen)[places]) for part in pairs.parts]
+    everywhere, looks = np.concatenate(scaled), np.tile(tested, pairs.looks)
+    return Invariance(
+        float(np.mean([_found(one, other) for one in scaled for other in scaled if one is not other])),
+        1 / count,
+        _probe(everywhere, np.tile(batch["state"], (pairs.looks, 1)), looks),
+        _probe(everywhere, np.concatenate(labels), looks),
+    )
+
+
+def _encoded(encoder: Callable[[np.ndarray], Any], pixels: np.ndarray) -> np.ndarray:
+    """(image, feature) float64."""
+    parts = [encoder(part) for part in np.split(pixels, range(ENCODED, len(pixels), ENCODED))]
+    arrays = [np.asarray(part.detach().cpu() if hasattr(part, "detach") else part, float) for part in parts]
+    return np.concatenate(arrays).reshape(len(pixels), -1)
+
+
+def _scaled(values: np.ndarray) -> np.ndarray:
+    """Columns that vary, centered, with a standard deviation of 1."""
+    std = values.std(axis=0)
+    varies = std > 1e-9 * (1 + np.abs(values).max(axis=0, initial=0))
+    return (values[:, varies] - values[:, varies].mean(axis=0)) / std[varies]
+
+
+def _real(labels: Any) -> np.ndarray:
+    """(image, label) of the labels that are real numbers."""
+    real = [value for _, value in labels.items() if value.dtype.kind == "f"]
+    return np.concatenate([value.reshape(len(value), -1) for value in real], axis=1).astype(float)
+
+
+def _found(one: np.ndarray, other: np.ndarray) -> float:
+    """Share of rows whose nearest row of the other array has their own number."""
+    distance = (other**2).sum(axis=1) - 2 * one @ other.T
+    return float((distance.argmin(axis=1) == np.arange(len(one))).mean())
+
+
+def _probe(features: np.ndarray, targets: np.ndarray, tested: np.ndarray) -> float:
+    """R2 on the tested rows of a ridge regression on the others."""
+    wanted, known = _scaled(targets.astype(float)), np.c_[features, np.ones(len(features))]
+    learned, own = known[~tested], wanted[~tested]
+    if not wanted.shape[1]:
+        return float("nan")
+    inner = learned.T @ learned + RIDGE * len(learned) * np.eye(learned.shape[1])
+    error = wanted[tested] - known[tested] @ np.linalg.solve(inner, learned.T @ own)
+    return float(1 - (error**2).sum() / ((wanted[tested] - own.mean(axis=0)) ** 2).sum())

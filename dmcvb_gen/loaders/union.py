@@ -1,0 +1,71 @@
+"""A union of subsets that differ in level, read as one: "walker-walk/medium-expert/none" as D4RL and V-D4RL name it.
+
+Episodes are numbered through: those of the second part come after all episodes that the first one will have.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+
+from dmcvb_gen.dataset.gate import Release, Shard
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.loaders.arrays import JoinedArray
+from dmcvb_gen.loaders.release import SubsetReader
+
+ALIKE = ("task", "setting", "size", "views", "hidden_goal", "max_steps", "action_repeat", "renderer", "backgrounds")
+"""Fields of their records in which the parts of a union are equal."""
+
+
+class UnionReader(SubsetReader):
+    """Subsets of one task and setting, read as one.
+
+    Attributes:
+      parts: the subsets, in the order in which they were named.
+    """
+
+    def __init__(self, release: Release, parts: Sequence[SubsetReader]):
+        records = [part.record for part in parts]
+        for field in ALIKE:
+            for record in records[1:]:
+                if getattr(record, field) != getattr(records[0], field):
+                    names = f"{records[0].name} and {record.name}"
+                    raise DmcvbError(f"{names} differ in {field}; unite subsets that are alike in it")
+        level = "-".join(record.level for record in records)
+        facts = {
+            "name": f"{records[0].name.split('/')[0]}/{level}/{records[0].setting}",
+            "level": level,
+            "episodes": sum(record.episodes for record in records),
+            "layers": tuple(dict.fromkeys(name for record in records for name in record.layers)),
+            "policies": tuple(policy for record in records for policy in record.policies),
+        }
+        super().__init__(release, records[0].model_copy(update=facts))
+        self.parts, self.fresh = tuple(parts), any(part.fresh for part in parts)
+        self._starts = np.cumsum([0, *(record.episodes for record in records[:-1])])
+
+    def set_epoch(self, epoch: int) -> None:
+        super().set_epoch(epoch)
+        for part in self.parts:
+            part.set_epoch(epoch)
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        return tuple(sorted(set.intersection(*(set(part.arrays) for part in self.parts))))
+
+    def array(self, name: str) -> Any:
+        return JoinedArray([part.array(name) for part in self.parts], self._starts)
+
+    @functools.cached_property
+    def _episodes(self) -> np.ndarray:
+        return np.concatenate([part.episodes + start for part, start in zip(self.parts, self._starts, strict=True)])
+
+    def shards(self, episodes: tuple[int, int] | None = None) -> Iterator[Shard]:
+        for part, start in zip(self.parts, self._starts, strict=True):
+            first, last = episodes or (0, self.record.episodes)
+            yield from part.shards((first - int(start), last - int(start)))
+
+    def paired(self, *settings: str) -> NoReturn:
+        raise DmcvbError(f"{self.name} is a union; pair its parts: [part.paired(...) for part in subset.parts]")

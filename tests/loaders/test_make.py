@@ -1,0 +1,68 @@
+"""One call for data and the environment that matches them; scores between random actions and the data's expert."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dmcvb_gen
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.info import describe_release
+from tests.conftest import TINY_MAZE
+
+NAMES = ["walker-walk/expert/dynamic", f"{TINY_MAZE}/random/visible", "walker-walk/random-expert/none"]
+SHORT = dict(size=16, max_steps=6, progress=False)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_call_gives_data_and_their_environment_and_makes_them_once(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    env, train, val = dmcvb_gen.make(name, episodes=5, environment={"stack": 2}, **SHORT)
+    levels = 2 if "-expert/" in name else 1
+    assert (len(train), len(val)) == (4 * levels, levels) and not {*train.episodes} & {*val.episodes}
+    batch = next(iter(train.batches(4, stack=2)))
+    observation, _ = env.reset(seed=0)
+    for key in ("pixels", "state"):
+        assert (observation[key].shape, observation[key].dtype) == (batch[key].shape[1:], batch[key].dtype)
+    assert env.unwrapped._stage.split == "val" and env.unwrapped._stage.max_steps == 6
+    [folder] = (tmp_path / "dmcvb-gen/made").iterdir()
+    digest = Release.open(folder).digest
+    again = dmcvb_gen.make(name, episodes=5, **SHORT)
+    assert [*again.train.episodes] == [*train.episodes] and Release.open(folder).digest == digest
+    grown = dmcvb_gen.make(name, episodes=6, **SHORT)
+    assert len(grown.train) + len(grown.val) == 6 * levels and len(list(folder.parent.iterdir())) == 1
+    same = dmcvb_gen.make(name, episodes=5, release=folder)
+    assert [*same.val.episodes] == [*val.episodes] and np.array_equal(same.val.returns, val.returns)
+
+
+def test_a_policy_is_scored_as_its_data_are_and_normalized_by_them(levels):
+    folder, (random, expert) = levels
+    release, task = dmcvb_gen.open(folder), expert.split("/")[0]
+
+    def still(observation):
+        assert observation.get("pixels", np.zeros((1, 1, 16, 16))).shape[2:] == (16, 16)
+        return np.zeros((len(observation["state"]), release[expert].array("action").shape[-1]))
+
+    score = release[expert].evaluate(still, split="train", episodes=2)
+    by_name = dmcvb_gen.evaluate(
+        still, f"{task}/{expert.split('/')[2]}", split="train", episodes=2, size=16, renderer="native", max_steps=6
+    )
+    assert score.returns == by_name.returns and by_name.normalized is None
+    low, high = (Release.open(folder)[name].read("return").mean() for name in (random, expert))
+    assert score.normalized == pytest.approx(100 * (score.mean - low) / (high - low))
+    assert release[expert].evaluate(still, episodes=1, max_steps=3, pixels=False).normalized is None
+    told = {subset["name"]: subset["normalized"] for subset in describe_release(folder)["subsets"]}
+    assert (told[random], told[expert]) == (0, 100)
+
+
+def test_what_cannot_be_made_is_refused_in_a_line(levels):
+    folder, (random, _) = levels
+    for call, words in (
+        (lambda: dmcvb_gen.make("walker-walk"), "'walker-walk' names no subset; give TASK/LEVEL/SETTING"),
+        (lambda: dmcvb_gen.make(random, release=folder, size=32), "size has no effect: with a release"),
+        (lambda: dmcvb_gen.make(random, release=folder, episodes=1), "has 1 episodes; give 2 or more"),
+        (lambda: dmcvb_gen.make(random, release=folder, held_out=1.5), "held_out is 1.5"),
+    ):
+        with pytest.raises(DmcvbError, match=words):
+            call()

@@ -1,0 +1,132 @@
+"""Pairs of images of the same states, stored or rendered on reading; and what an encoder keeps of them."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from torch.utils.data import DataLoader
+
+import dmcvb_gen
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.pictures import picture_arrays
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from tests.conftest import TINY_MAZE, roll_out, small_recipe, stack_channels
+
+FAMILIES = {"walker-walk": ["none", "static"], "ant-maze-tiny": ["visible", "hidden"]}
+FEW = {"levels": "random", "episodes": 4, "episodes_per_shard": 2, "max_steps": 12}
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def made(request, tmp_path_factory):
+    """(folder, names of two subsets): the release is "whole" in that folder, and "light" has no images."""
+    folder, settings = tmp_path_factory.mktemp(request.param), FAMILIES[request.param]
+    task = TINY_MAZE if request.param.startswith("ant") else request.param
+    for name in ("whole", "light"):
+        recipe = small_recipe(name="pairs", subsets=[FEW | {"tasks": task, "settings": settings}])
+        roll_out(recipe, folder / name, pixels=name == "whole")
+    return folder, [f"{request.param}/random/{setting}" for setting in settings]
+
+
+def paired(folder, names, *settings, **options):
+    return dmcvb_gen.open(folder, **options)[names[0]].paired(*(settings or FAMILIES[names[0].split("/")[0]]))
+
+
+def by_step(batches):
+    """(episode, step) -> pixels of a step."""
+    each = [zip(batch["episode"], batch["step"], batch["pixels"], strict=True) for batch in batches]
+    return {(int(episode), int(step)): np.asarray(pixels) for rows in each for episode, step, pixels in rows}
+
+
+@pytest.mark.parametrize("which", ["whole", "light"])
+def test_a_pair_shows_each_state_under_both_settings_in_every_form(made, which):
+    folder, names = made
+    stored, images = [Release.open(folder / "whole")[name] for name in names], [("pixels",)] * 2
+    if names[0].startswith("ant"):  # the states of both looks are those of the first subset
+        stored[1], images = stored[0], [picture_arrays(stored[0].record.views, hidden) for hidden in (False, True)]
+    episodes = [[subset.episode(e, arrays) for e in range(4)] for subset, arrays in zip(stored, images, strict=True)]
+    pairs = paired(folder / which, names)
+    again, source = pickle.loads(pickle.dumps(pairs)), pairs.source(in_memory=False)
+    forms = [pairs.batches(8), again.torch("stream", batch_size=8), [pairs.source().gather(range(len(source)))]]
+    forms += [DataLoader(pairs.torch("steps"), batch_size=8), [source.gather(range(pairs.steps))]]
+    for form in forms:
+        found = by_step(form)
+        assert len(found) == pairs.steps
+        for (episode, step), pixels in found.items():
+            for look, arrays in enumerate(episodes):
+                rows = [[each[max(step - back, 0)] for each in arrays[episode].values()] for back in (2, 1, 0)]
+                np.testing.assert_array_equal(pixels[look], stack_channels(rows))
+    whole = pairs.torch("episodes")[1]["pixels"].numpy()
+    shape = (int(pairs.lengths[1]) + 1, 2, 3 * len(stored[0].record.views), 16, 16)
+    assert whole.shape == shape and np.array_equal(whole[3], by_step(pairs.batches(9, stack=1))[1, 3])
+    assert pairs.xarray()[pairs.pixel_arrays[0].replace("/", "_")].dims[2] == "setting"
+    assert next(iter(pairs.batches(4, pictures="agents", next_step=True)))["next_pixels"].shape[:2] == (4, 2)
+
+
+def test_settings_that_are_not_stored_or_named_twice_are_fresh_and_change_with_the_epoch(made):
+    folder, names = made
+    first, second = FAMILIES[names[0].split("/")[0]]
+    fresh = [second, "dynamic_hard"] if first == "none" else [second]
+    pairs = paired(folder / "whole", names, first, second, *fresh)
+    data, seen = pairs.torch("steps", in_memory=False), []
+    for epoch in (0, 1, 0):
+        data.set_epoch(epoch)
+        seen.append([each.numpy() for each in data[5]["pixels"]])
+    assert all(np.array_equal(one, other) for one, other in zip(seen[0], seen[2], strict=True))
+    changed = [not np.array_equal(one, other) for one, other in zip(*seen[:2], strict=True)]
+    assert changed == [False, False, *(True for _ in fresh)]
+    assert all(not np.array_equal(seen[0][1], look) for look in seen[0][2:])
+    twice = paired(folder / "light", names, second, second, paint=True, distractors="resample")
+    one, other = twice.source()[0]["pixels"]
+    assert not np.array_equal(one, other)
+
+
+def test_what_cannot_be_paired_is_refused_in_a_line(made):
+    folder, names = made
+    with pytest.raises(DmcvbError, match="1 settings are given; give two or more"):
+        paired(folder / "whole", names, FAMILIES[names[0].split("/")[0]][0])
+    with pytest.raises(UnknownNameError, match="stattic"):
+        paired(folder / "whole", names, "stattic", "stattic")
+
+
+def knowing(pairs, values):
+    """An encoder that knows the answer: the row of each image's own bytes."""
+    table = {}
+    for batch in pairs.batches(64, shuffle=False, stack=1):
+        for look in range(pairs.looks):
+            rows = zip(batch["pixels"][:, look], values(batch, look), strict=True)
+            table |= {pixels.tobytes(): row for pixels, row in rows}
+    return lambda pixels: np.stack([table[each.tobytes()] for each in pixels])
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    """Pairs of 8 short episodes of the walker without and with dynamic distractors."""
+    few = FEW | {"tasks": "walker-walk", "settings": ["none", "dynamic"], "episodes": 8}
+    folder = tmp_path_factory.mktemp("pairs") / "r"
+    roll_out(small_recipe(name="pairs", subsets=[few]), folder)
+    return dmcvb_gen.open(folder)["walker-walk/random/none"].paired("none", "dynamic")
+
+
+def labels_of(pairs, batch, look):
+    labels = pairs.parts[look].labels(range(8))[batch["episode"], batch["step"]]
+    return np.concatenate([value.reshape(len(value), -1) for _, value in labels.items()], axis=1)
+
+
+def test_invariance_of_encoders_that_know_the_answer(pairs):
+    """One that sees the state alone, one that sees the distractors alone, and one that sees nothing."""
+    noise = np.random.default_rng(0)
+    state = pairs.evaluate_invariance(knowing(pairs, lambda batch, look: batch["state"]), stack=1)
+    assert state.retrieval == 1 and state.state > 0.98 and state.distractors < 0.2
+    distractors = pairs.evaluate_invariance(knowing(pairs, lambda *which: labels_of(pairs, *which)), stack=1)
+    assert distractors.retrieval < 0.1 and distractors.distractors > 0.98 and distractors.state < 0.2
+    nothing = pairs.evaluate_invariance(lambda pixels: noise.normal(size=(len(pixels), 8)), stack=1)
+    assert nothing.chance == 1 / 96 and nothing.retrieval < 0.1 and max(nothing.state, nothing.distractors) < 0.1
+
+
+def test_a_probe_of_one_episode_is_refused(pairs):
+    one = pairs.part([0])
+    assert len(one) == 1 and one.steps == 12
+    with pytest.raises(DmcvbError, match="has 1 episodes; a probe needs 2"):
+        one.evaluate_invariance(lambda pixels: pixels)
