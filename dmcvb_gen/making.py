@@ -167,7 +167,7 @@ def make(
         opened = open_for_reading(str(release))
     else:
         options |= {"goals" if is_maze(task) else "distractors": setting, "seed": seed}
-        opened = _cached(task, level.split("-"), episodes, options)
+        opened = _cached(task, tuple(level.split("-")), episodes, options)
     train, val = [], []
     for part in opened.parts_of(name) or [name]:
         subset = opened[part]
@@ -181,14 +181,14 @@ def make(
     return Made(learned.environment(**environment or {}), learned, held)
 
 
-def _cached(task: str, levels: list[str], episodes: int | None, options: dict[str, Any]) -> "ReleaseReader":
+def _cached(task: str, levels: tuple[str, ...], episodes: int | None, options: dict[str, Any]) -> "ReleaseReader":
     """Roll a task out in the user's cache; a folder for each choice of options but the number of episodes."""
     from dmcvb_gen.policies.archives import cache_folders
 
     decide = {key: str(value) for key, value in options.items() if key not in ("workers", "progress")}
     mark = hashlib.sha256(json.dumps([task, levels, decide], sort_keys=True).encode()).hexdigest()[:12]
     folder = cache_folders()[0].parent / "made" / mark
-    return rollout(task, levels=levels, episodes=episodes, out=folder, **options)
+    return rollout((task,), levels=levels, episodes=episodes, out=folder, **options)
 
 
 @checked

@@ -50,7 +50,7 @@ def evaluate_invariance(
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.permutation(pairs.episodes)[:episodes])
     source = pairs.source(episodes=chosen, in_memory=True, **options)
-    batch = source.gather(np.sort(rng.permutation(len(source))[:states]))
+    batch = source.gather(sorted(rng.permutation(len(source))[:states].tolist()))
     count, tested = len(batch["step"]), np.isin(batch["episode"], chosen[1::2])
     features = [_encoded(encoder, batch["pixels"][:, look]) for look in range(pairs.looks)]
     scaled = np.split(_scaled(np.concatenate(features)), pairs.looks)

@@ -50,17 +50,6 @@ def test_pictures_painted_on_reading_are_the_stored_ones(made, which):
         assert all(np.array_equal(one[key], other[key]) for key in one)
 
 
-def test_fresh_distractors_change_pictures_alone_and_repeat_by_epoch(made):
-    subset = distracted(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample"))
-    array = subset.picture_names[0]
-    before, state = subset.read(array, [0]), subset.read("state", [0])
-    subset.set_epoch(1)
-    after = subset.read(array, [0])
-    assert (before != after).any() and np.array_equal(state, subset.read("state", [0]))
-    subset.set_epoch(0)
-    assert np.array_equal(before, subset.read(array, [0]))
-
-
 def test_labels_of_fresh_distractors_are_those_of_their_pictures(made):
     """The labels of an epoch are the ones that its pictures are painted from."""
     for name in dmcvb_gen.open(str(made / "light")):
@@ -204,14 +193,6 @@ def test_painted_episodes_are_kept_while_there_is_room(made):
     subset.painting.__dict__["cache_bytes"] = 1
     first = subset.painted(1, [name])[name]
     assert subset.painted(2) and subset.painted(1, [name])[name] is not first
-
-
-def test_a_torch_loader_with_workers_paints(made):
-    import torch
-
-    subset = next(iter(dmcvb_gen.open(str(made / "light"), paint=True).subsets.values()))
-    loader = torch.utils.data.DataLoader(subset.torch("stream", batch_size=4), batch_size=None, num_workers=1)
-    assert sum(len(batch["reward"]) for batch in loader) == subset.steps
 
 
 def test_a_way_of_painting_that_there_is_not_is_refused(made):
