@@ -256,16 +256,22 @@ def _medium(curve: Sequence[Point], goal: float, tolerance: float, check: Callab
 def _mixed(curve: Sequence[Point], last: int, check: Callable) -> tuple[Pick, ...] | str:
     """Eight checkpoints evenly spaced in training steps from step 0 to `last`, or which is missing.
 
-    The rule, for every task and algorithm: those whose steps are nearest to i / 7 of medium's step, i from 0 to 7.
-    Returns decide nothing, so checkpoints before any learning are among them, and medium itself is the last.
+    The rule, for every task and algorithm: for i from 0 to 6 the checkpoint before medium, not yet taken, whose step is
+    nearest to i / 7 of medium's step, and off by at most 1 / 7 of it; then medium. Returns decide nothing, so
+    checkpoints before any learning are among them.
     """
-    picks = []
-    for index, goal in enumerate(np.linspace(0, last, MIXED_COUNT)):
-        step, value, path = min(curve, key=lambda point: abs(point[0] - goal))
-        if abs(step - goal) > last / (MIXED_COUNT - 1) / 2:
+    *free, medium = [point for point in curve if point[0] <= last]
+    goals, chosen = np.linspace(0, last, MIXED_COUNT), list[Point]()
+    for index, goal in enumerate(goals[:-1]):
+        point = min(free, key=lambda point: abs(point[0] - goal), default=None)
+        if point is None or abs(point[0] - goal) > goals[1]:
             return f"no checkpoint near step {goal:.0f} (number {index + 1} of {MIXED_COUNT}); evaluate more often"
-        picks.append(Pick(f"mixed_{index}", f"step {goal:.0f}", step, value, str(path), check(path)))
-    return tuple(picks)
+        free.remove(point)
+        chosen.append(point)
+    return tuple(
+        Pick(f"mixed_{index}", f"step {goal:.0f}", step, value, str(path), check(path))
+        for index, (goal, (step, value, path)) in enumerate(zip(goals, [*chosen, medium], strict=True))
+    )
 
 
 def select_checkpoints(

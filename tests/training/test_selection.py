@@ -130,9 +130,14 @@ def test_a_few_evaluations_are_enough_and_say_how_sure_they_are(returns, value, 
     assert end.error == error or (error is None and np.isnan(end.error))
 
 
-def test_checkpoints_too_far_apart_for_mixed_say_which_is_missing():
+def test_mixed_are_eight_different_checkpoints_or_say_which_is_missing():
+    steps = [pick.step for pick in select(rising(), keep=lambda step: step % 2000 == 0).picks["mixed"]]
+    assert steps == [2000, 4000, 6000, 8000, 12_000, 14_000, 18_000, 20_000]  # nearest to 0 and to 2857 is one
     found = select(rising(), keep=lambda step: not 4000 < step < 15_000)
-    assert "near step 5714 (number 3 of 8)" in found.reasons["mixed"] and "medium" in found.picks
+    assert "near step 8571 (number 4 of 8)" in found.reasons["mixed"] and "medium" in found.picks
+    seven = (1000, 3000, 6000, 9000, 11_000, 14_000, 20_000)
+    found = select(rising(), keep=lambda step: step in seven or step > 30_000)
+    assert "near step 17143 (number 7 of 8)" in found.reasons["mixed"]
 
 
 def test_a_maze_medium_is_nearest_to_the_papers_row_and_there_is_no_mixed():
