@@ -20,10 +20,8 @@ from dmcvb_gen.agents.data import FRAMES, Sizes
 from dmcvb_gen.agents.learners import PARTS, Learner, Policy, ReadyEncoder
 from dmcvb_gen.agents.networks import PAPER, Architecture, Encoder, observation_encoder, state_encoder
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.own_code import source_digest
+from dmcvb_gen.own_code import is_own, source_digest
 
-OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-"""A user's own agent: "module:name"."""
 MOST = 64
 """The largest number that an option takes."""
 
@@ -129,7 +127,7 @@ def parse_agent(name: str) -> Agent:
       UnknownNameError, DmcvbError: no such agent or option, or one that this agent has no use for.
     """
     known = agent_names()
-    if OWN.fullmatch(name.strip()) and name.partition(":")[0].lower() not in known:
+    if is_own(name.strip()) and name.partition(":")[0].lower() not in known:
         return Agent("bc", own=name.strip())
     base, _, options = name.strip().lower().partition(":")
     base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
@@ -140,19 +138,14 @@ def parse_agent(name: str) -> Agent:
     else:
         pretrain, _, policy = base.rpartition("+")
         agent = Agent(policy, pretrain or None)
-    try:
-        return _with_options(agent, options)
-    except DmcvbError as error:
-        own = OWN.fullmatch(name.strip()) and options not in option_names()
-        hint = f"; if {base}.py is a module of yours, rename it: {base} is an agent of the package" if own else ""
-        raise DmcvbError(f"agent {name!r}: {error}{hint}") from None
+    return _with_options(agent, options)
 
 
 def _with_options(agent: Agent, text: str) -> Agent:
     """An agent with the options "k=5,sample".
 
     Raises:
-      DmcvbError: one is unknown, or of another agent, or they do not go together.
+      DmcvbError: one is unknown, or of another agent.
     """
     parts = [part for part in (agent.pretrain, agent.policy) if part]
     defaults = {} if agent.sees_state else {"frames": FRAMES}
@@ -161,36 +154,18 @@ def _with_options(agent: Agent, text: str) -> Agent:
     values: dict[str, int | bool] = {}
     for option in filter(None, text.split(",")):
         key, _, value = option.partition("=")
-        if key not in defaults:
-            raise DmcvbError(_refusal(option, key, defaults))
-        if isinstance(defaults[key], bool) and not value:
+        kind = type(defaults.get(key))
+        if kind is bool and not value:
             values[key] = True
-        elif not isinstance(defaults[key], bool) and value.isdigit() and 1 <= int(value) <= MOST:
+        elif kind is int and value.isdigit() and 1 <= int(value) <= MOST:
             values[key] = int(value)
         else:
-            raise DmcvbError(f"{option!r} is not an option; it takes {_listed(defaults)}")
+            takes = [name if isinstance(default, bool) else f"{name}=1..{MOST}" for name, default in defaults.items()]
+            what = f"{option!r} is not an option of agent {agent.base}"
+            raise DmcvbError(f"{what}; it takes {', '.join(takes) or 'none'}")
     agent = replace(agent, stack=int(values.pop("frames", FRAMES)))
     changed = tuple((key, values[key]) for key in defaults if values.get(key, defaults[key]) != defaults[key])
-    agent = replace(agent, options=changed)
-    for part in parts:
-        if issubclass(PARTS.get(part), Learner):
-            PARTS.get(part).check_options(**agent.options_of(part))
-    return agent
-
-
-def _refusal(option: str, key: str, defaults: dict[str, int | bool]) -> str:
-    """Why an option is refused: nothing knows it, or others do."""
-    owners = [name for name, part in PARTS.all().items() if key in part.options]
-    takes = f"it takes {_listed(defaults)}" if defaults else "it takes none"
-    if key == "frames":
-        return f"states are not stacked, so {option!r} has no effect: remove it"
-    if owners:
-        return f"{option!r} is an option of {', '.join(owners)}: remove it; {takes}"
-    return f"{option!r} is not an option; {takes}"
-
-
-def _listed(defaults: dict[str, int | bool]) -> str:
-    return ", ".join(name if isinstance(value, bool) else f"{name}=1..{MOST}" for name, value in defaults.items())
+    return replace(agent, options=changed)
 
 
 def make_encoder(

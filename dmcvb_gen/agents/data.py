@@ -470,6 +470,3 @@ def load_data(
         table.action[:] = to_unit(table.action, *(np.array(bounds[name], np.float32) for name in ("low", "high")))
     returns = np.concatenate([part.subset.read("return", part.episodes) for part in parts])
     return TrainingData(table, np.concatenate(held_out), stack, returns, device)
-
-
-__all__ = ["Batch", "Normalization", "Slice", "TrainingData", "batches", "load_data", "training_episodes"]

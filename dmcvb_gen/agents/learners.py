@@ -99,14 +99,6 @@ class Learner(nn.Module, abc.ABC):
         self.optimizers: dict[str, torch.optim.Optimizer] = {}
         self.half = False
 
-    @classmethod
-    def check_options(cls, **options: int | bool) -> None:
-        """Refuse options that do not go together.
-
-        Raises:
-          DmcvbError: two of them exclude each other, or one needs another.
-        """
-
     @abc.abstractmethod
     def losses(self, batch: Batch) -> dict[str, torch.Tensor]:
         """Named losses; the one called "loss" is minimized."""

@@ -31,7 +31,6 @@ from dmcvb_gen.agents.networks import (
     initialize,
     state_decoder,
 )
-from dmcvb_gen.errors import DmcvbError
 
 
 @register_agent("bc")
@@ -79,11 +78,6 @@ class InverseDynamics(Learner):
         self.embed_k = initialize(nn.Linear(1, LATENT)) if sample else None
         self.f = MLP(2 * encoder.features + sample * LATENT, sizes.action, tanh=True)
         self.optimizers = {"main": adam([self])}
-
-    @classmethod
-    def check_options(cls, k: int = 1, sample: bool = False) -> None:
-        if sample and k == 1:
-            raise DmcvbError("sample draws k from 1 to a largest one; give it, k=2 or more")
 
     def losses(self, batch):
         both = self.encoder(torch.cat([batch.observation, batch.next_observation]))  # (2 batch, latent)

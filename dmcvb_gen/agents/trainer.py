@@ -32,6 +32,8 @@ POINTS = 50
 """Points of the learning curve."""
 SAVE_SECONDS = 120.0
 """Seconds of work that a stop may cost."""
+TICK_SECONDS = 0.2
+"""Progress is told no more often: an Adam step on states takes less time than telling of it."""
 RESUME_FILE = "resume.safetensors"
 
 Curve = list[dict[str, Any]]
@@ -192,7 +194,8 @@ def train(
         for name in learner.compiled:
             setattr(learner, name, compiled(getattr(learner, name)))
     evaluate_every, log_every = -(-steps // (budget.evaluations if evaluate else 1)), max(1, steps // POINTS)
-    started = saved = time.perf_counter()
+    started = saved = told_at = time.perf_counter()
+    told = first
 
     def make(step: int, reuse: Batch | None) -> Batch:
         return draw(learner, data, size, budget.seed, step, shift=shift, reuse=reuse)
@@ -204,8 +207,10 @@ def train(
         schedule.at(step)
         means.add(learner.update(batch))
         done = step + 1
-        tick(1)
         evaluating = done % evaluate_every == 0 or done == steps
+        if evaluating or time.perf_counter() - told_at > TICK_SECONDS:
+            tick(done - told)
+            told, told_at = done, time.perf_counter()
         if evaluating or done % log_every == 0:
             point = {"step": done, **means.take(done), **hold_out_losses(learner, data, size, steps)}
             if evaluating and evaluate:

@@ -16,10 +16,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import importlib
 import inspect
 import json
-import os
 import shutil
 import sys
 import time
@@ -49,16 +47,13 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
 from dmcvb_gen.loaders.sampler import StepSource
-from dmcvb_gen.own_code import source_digest
-from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, ignore, open_pool
-from dmcvb_gen.parallel.cores import usable_cores
+from dmcvb_gen.own_code import AGENTS, find_function, source_digest
+from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, cores, ignore, open_pool
 from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
 
 RESULT_VERSION = 4
-TICK_SECONDS = 0.2
-"""Progress is told no more often: an Adam step on states takes less than telling of it."""
 INSPECTED = 150_000
 """Held-out transitions that an inspection's error is the mean of, at most (the paper's number)."""
 UNIT_EPISODES = 100
@@ -105,15 +100,10 @@ class OwnAgent:
         """Import it; modules of the working folder are found.
 
         Raises:
-          DmcvbError: there is no such module or name, importing it fails, or it cannot be called.
+          DmcvbError: the user did not ask for it (a result file named it), there is no such module or name, importing
+            it fails, or it cannot be called.
         """
-        module, _, attribute = name.partition(":")
-        if os.getcwd() not in sys.path:
-            sys.path.insert(0, os.getcwd())
-        try:
-            value = getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # a user's module may raise anything
-            raise DmcvbError(f"cannot load agent {name} ({error}); give MODULE:NAME, run from its folder") from None
+        value = find_function(name, AGENTS, "agent")
         if not callable(value):
             raise DmcvbError(f"agent {name} is a {type(value).__name__}; expected a policy or a function of `data`")
         agent = cls(name, value)
@@ -294,7 +284,7 @@ class CellRun:
         """Train and score it, unless its result is there.
 
         A ready policy of the user's is scored each time: its score hangs on more than its code, and costs one
-        evaluation. A kept result of an own agent that learns has "kept": True.
+        evaluation.
 
         Raises:
           DmcvbError: the renderer cannot start, training does not stay finite, or an own policy gives no actions.
@@ -302,7 +292,7 @@ class CellRun:
         encoder = self.cell.benchmark == ENCODER
         done = None if self.own and not self.own.learns else read_result(self.path(".json"), self.mark)
         if done and (not encoder or self.path(".safetensors").exists()):
-            return done | {"kept": True} if self.own else done
+            return done
         made = self._pretrain() if encoder else self._score_own(self.own) if self.own else self._train()
         facts = {"id": self.cell.id, "fingerprint": self.mark, "cell": self.cell.facts()}
         facts |= {"budget": self.budget.facts() | {"note": self.budget.note}, **made}
@@ -655,38 +645,17 @@ def try_cell(
 ) -> dict[str, Any]:
     """The result of a cell, its errors as a result."""
     folder = "encoders" if cell.benchmark == ENCODER else "cells"
-    log, paced = Path(out) / folder / f"{cell.id}.log", _Pace(tick)
+    log = Path(out) / folder / f"{cell.id}.log"
     try:
-        result = CellRun(root, out, budget, cell, paced).result()
+        result = CellRun(root, out, budget, cell, tick).result()
     except DmcvbError as error:
         return {"error": str(error)}
     except Exception as error:  # one cell's bug or lack of memory must not cost the hours of the others
         write_text(log, traceback.format_exc())
         first = (str(error).splitlines() or [""])[0]
         return {"error": f"{type(error).__name__}: {first} (all of it in {log})"}
-    finally:
-        paced.tell()
     log.unlink(missing_ok=True)
     return result
-
-
-class _Pace:
-    """A tick that adds steps up and passes them on a few times a second."""
-
-    def __init__(self, tick: ProgressCallback):
-        self._tick, self._what, self._steps, self._told = tick, "", 0, time.monotonic()
-
-    def __call__(self, what: str, steps: int) -> None:
-        if what != self._what:
-            self.tell()
-        self._what, self._steps = what, self._steps + steps
-        if time.monotonic() - self._told > TICK_SECONDS:
-            self.tell()
-
-    def tell(self) -> None:
-        if self._what:
-            self._tick(self._what, self._steps)
-        self._steps, self._told = 0, time.monotonic()
 
 
 def planned_steps(budget: Budget, cells: Sequence[Cell]) -> int:
@@ -699,9 +668,4 @@ def planned_steps(budget: Budget, cells: Sequence[Cell]) -> int:
 
 def default_workers(device: str) -> int:
     """Cells side by side: two of one thread each are faster than one of two. An accelerator is not shared."""
-    return min(2, usable_cores()) if device == "cpu" else 1
-
-
-def default_threads(workers: int) -> int:
-    """Threads of each of `workers` processes."""
-    return max(1, usable_cores() // workers)
+    return cores.default_workers(2 if device == "cpu" else 1)

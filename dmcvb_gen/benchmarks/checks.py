@@ -18,7 +18,7 @@ import numpy as np
 
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.benchmarks.evaluate import SPLIT
-from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell
+from dmcvb_gen.benchmarks.plan import Cell
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
@@ -232,13 +232,10 @@ def check_structure(
       DmcvbError: nothing is committed.
     """
     started = time.perf_counter()
-    wanted = {record.name for record in release.manifest.subsets}
     all_records = Release.open(release.path).manifest.subsets
-    others = {record.name for record in all_records} - wanted
-    ours = {name for record in release.manifest.subsets for name in record.layers}
-    not_ours = {name for record in all_records for name in record.layers} - ours | others
-    again = len(release.subsets)  # for labels; and of the others only the bytes are looked at
-    tick = _Longer(tick, again - (len(wanted | others) - again))
+    ours = {name for record in release.manifest.subsets for name in (record.name, *record.layers)}
+    not_ours = {name for record in all_records for name in (record.name, *record.layers)} - ours
+    tick = _Longer(tick, 2 * len(release.subsets) - len(all_records))  # labels follow; of others bytes alone count
     with open_pool(workers, tick=tick) as pool:
         verified = verify(release.path, backgrounds, tick, pool, names=release.subsets)
         findings, warnings = [f for f in verified.findings if f.subset not in not_ours], [*verified.unchecked]
@@ -267,10 +264,8 @@ def training_warnings(release: Release, budget: Budget, results: Results) -> Ite
     """List what makes the scores of cells say less than they seem to."""
     cells = [cell for cell, _ in results]
     yield from _seen_warnings(release, cells, budget.backgrounds)
-    for name in dict.fromkeys(cell.benchmark for cell in cells):
-        yield from BENCHMARKS.get(name).warnings(release, [cell for cell in cells if cell.benchmark == name])
     if budget.scores:
-        found = [_learning_warning(budget, *each) or _few_warning(budget, *each) for each in results]
+        found = [_learning_warning(budget, *each) for each in results]
         yield from dict.fromkeys(issue for issue in found if issue)
 
 
@@ -286,20 +281,6 @@ def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | N
         if seen:
             text = f"painted with the {what} that evaluation shows: its scores are of distractors that were seen"
             yield Issue("learning", record.name, text)
-
-
-def _few_warning(budget: Budget, cell: Cell, result: Mapping[str, Any]) -> Issue | None:
-    """Tell of data so few that pictures are shifted, for which a short training is too short."""
-    agent, steps = cell.agent, budget.pixel_steps
-    end_to_end = not (agent.sees_state or agent.own or agent.pretrain) and len(cell.policy) == 1
-    if not (end_to_end and budget.shift_from and cell.benchmark == "b1" and "error" not in result):
-        return None
-    if not budget.shifts(steps, result["transitions"]):
-        return None
-    drawn = steps * budget.batch_size
-    text = f"{budget.name} passes {drawn / result['transitions']:.0f} times over its {result['transitions']:,} steps"
-    text += f", so it shifts the images and learns more slowly; from {drawn / budget.shift_from:,.0f} on it does not"
-    return Issue("learning", cell.policy[0].subset, text)
 
 
 def _learning_warning(budget: Budget, cell: Cell, result: Mapping[str, Any]) -> Issue | None:

@@ -559,15 +559,12 @@ def load_agent(path: str | Path) -> TrainedAgent:
         agent, sizes, network = parse_agent(facts["agent"]), Sizes(**facts["sizes"]), Architecture(**facts["network"])
         if normalization.mean.shape != (sizes.state,) or normalization.std.shape != (sizes.state,):
             raise ValueError("the normalization does not fit")
-        with torch.device("meta"):  # without memory: a file may name any size
-            expected = _untrained(agent, sizes, network)
-        for name, weight in expected.state_dict().items():
-            if expected.acts_by(name) and (name not in tensors or tensors[name].shape != weight.shape):
-                raise ValueError(f"{name} does not fit")
-        policy = _untrained(agent, sizes, network)
-        unexpected = policy.load_state_dict(tensors, strict=False).unexpected_keys
-        if unexpected:
-            raise ValueError(f"{unexpected[0]} does not fit")
+        for device in ("meta", "cpu"):  # without memory first: a file may name any size
+            with torch.device(device):
+                policy = _untrained(agent, sizes, network)
+            missing, unexpected = policy.load_state_dict(tensors, strict=False, assign=device == "meta")
+            if unexpected or any(map(policy.acts_by, missing)):
+                raise ValueError("its weights do not fit")
         policy.half = bool(facts["half"])
         return TrainedAgent(agent, sizes, policy.eval(), normalization, dict(facts.get("evaluation", {})))
     except (OSError, SafetensorError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:

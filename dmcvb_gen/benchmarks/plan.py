@@ -13,7 +13,7 @@ import functools
 import itertools
 import re
 import shlex
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
 from typing import Any
@@ -26,11 +26,9 @@ from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.generate.inputs import BUILTIN, video_source
-from dmcvb_gen.policies.bundled import bundled_levels
+from dmcvb_gen.own_code import AGENTS, allow
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task
 from dmcvb_gen.registry import Registry
-from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import (
     ANT_MAZE,
     DISTRACTOR_KINDS,
@@ -208,19 +206,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Missing:
-    """Subsets that a part of a benchmark needs besides.
-
-    Attributes:
-      subsets: those that the release lacks.
-      command: command that gets those.
-      left_out: those that the release has and the user left out.
-    """
+    """Subsets that a benchmark needs of a task and does not find, and the command that makes them."""
 
     benchmark: str
     task: str
     subsets: tuple[str, ...]
     command: str
-    left_out: tuple[str, ...] = ()
 
 
 def only(release: Release, patterns: Sequence[str]) -> Release:
@@ -245,7 +236,6 @@ class SubsetFinder:
         self._records = {name: subset.record for name, subset in release.subsets.items()}
         self.tasks = tuple(dict.fromkeys(subset.task for subset in release.subsets.values()))
         self._asked: dict[str, list[tuple[str, str]]] = {}
-        self._partial: dict[str, tuple[int, ...]] = {}
 
     def settings(self, task: str) -> list[str]:
         """Settings of a task: those there are, in the paper's order, other difficulties last."""
@@ -274,26 +264,17 @@ class SubsetFinder:
         names = self.find(task, [level], setting)
         return names and tuple(Slice(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
 
-    def pairs(self, name: str) -> tuple[int, ...]:
-        """The goal pairs of a fixed-goal subset whose episodes are all there; the others are noted."""
-        whole, partial = goal_pairs(self.release[name])
-        if partial:
-            self._partial[name] = partial
-        return whole
-
-    def missing(self, benchmark: str, left_out: Collection[str]) -> list[Missing]:
-        found = []
-        for task, asked in self._asked.items():
-            names = {subset_name(task, level, setting): (level, setting) for level, setting in asked}
-            excluded = tuple(name for name in names if name in left_out)
-            names = {name: where for name, where in names.items() if name not in left_out}
-            command = self._command(benchmark, task, list(names.values())) if names else ""
-            found.append(Missing(benchmark, task, tuple(names), command, excluded))
-        for name, pairs in self._partial.items():
-            lacking = f"{name}, episodes of goal pairs {', '.join(map(str, pairs))}"
-            task = self._records[name].task
-            found.append(Missing(benchmark, task, (lacking,), "fetch them, or run the release's rollout again"))
-        return found
+    def missing(self, benchmark: str) -> list[Missing]:
+        """What was asked for in vain, by task."""
+        return [
+            Missing(
+                benchmark,
+                task,
+                tuple(dict.fromkeys(subset_name(task, level, setting) for level, setting in asked)),
+                self._command(benchmark, task, asked),
+            )
+            for task, asked in self._asked.items()
+        ]
 
     def _command(self, benchmark: str, task: str, lacking: list[tuple[str, str]]) -> str:
         """Return the command that rolls out a task with what is missing and what the release has of it."""
@@ -302,7 +283,7 @@ class SubsetFinder:
         settings = dict.fromkeys(setting for _, setting in have + lacking)
         counts = [self._records[self._names[task, *place]].episodes for place in have if place[1] != FIXED]
         count = max(counts, default=DEFAULT_EPISODES)
-        shape = self._shape(task) + self._sources(task, levels)
+        shape = self._shape(task)
         rollout = f"dmcvb-gen rollout {shlex.quote(task)} " + " ".join(f"--level {level}" for level in levels)
         out = f"--out releases/{slug(benchmark)}"
         if not is_maze(task):
@@ -311,12 +292,6 @@ class SubsetFinder:
         asked = [f"--goal {setting}" for setting in goals] + [f"--episodes {count}"] * bool(goals)
         asked += [f"--goal {FIXED}{FIXED_GOALS}"] * (FIXED in settings)
         return f"{rollout} {' '.join(asked)}{shape} {out}"
-
-    def _sources(self, task: str, levels: Iterable[str]) -> str:
-        """Options for policies and videos that the package does not bring, with names to be filled in."""
-        sources = {video_source(self.release.path, r) for r in self._records.values() if r.task == task}
-        brought = {"random", *bundled_levels(task)}
-        return " --behaviour RUN" * (not set(levels) <= brought) + " --backgrounds FOLDER" * bool(sources - {BUILTIN})
 
     def _shape(self, task: str) -> str:
         """Options that give new subsets the images' size and the time limit of what there is of a task."""
@@ -332,19 +307,18 @@ class SubsetFinder:
 # -- fixed goals of a maze --------------------------------------------------------------------------
 
 
-def goal_pairs(subset: Subset) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Indices of the (start, goal) pairs whose every episode is there, and of the others.
+def goal_pairs(subset: Subset) -> tuple[int, ...]:
+    """Indices of the (start, goal) pairs whose every episode is there.
 
     The subset's record decides, never how much of it is at hand: a part of a release is scored on the starts and goals
     of the whole one. If the record does not say it (imported data), the episodes' own labels do.
     """
     per_goal = subset.record.episodes_per_goal
     if per_goal is None:
-        return tuple(int(pair) for pair in np.unique(subset.read("goal_pair")) if pair >= 0), ()
+        return tuple(int(pair) for pair in np.unique(subset.read("goal_pair")) if pair >= 0)
     count, have = subset.record.episodes, set(map(int, subset.episodes))
-    firsts = dict(enumerate(range(0, count, per_goal)))
-    whole = [p for p, first in firsts.items() if have.issuperset(range(first, min(first + per_goal, count)))]
-    return tuple(whole), tuple(pair for pair in firsts if pair not in whole)
+    firsts = enumerate(range(0, count, per_goal))
+    return tuple(pair for pair, first in firsts if have.issuperset(range(first, min(first + per_goal, count))))
 
 
 def goal_cells(subset: Subset, pair: int | None) -> tuple[tuple[int, int], tuple[int, int]] | None:
@@ -433,10 +407,6 @@ class Benchmark(abc.ABC):
         row = paper_task(cell.task)
         return (row, cell.policy_label) if row in MAZE_GROUPS.values() else None
 
-    def warnings(self, release: Release, cells: Sequence[Cell]) -> Iterator[Issue]:
-        """List what makes its scores say less than they seem to."""
-        return iter(())
-
 
 def _whole_setting(cell: Cell) -> str:
     return VISIBLE if is_maze(cell.task) else DISTRACTOR_KINDS[0]
@@ -460,26 +430,24 @@ def register_benchmark(name: str) -> Callable[[type[Benchmark]], type[Benchmark]
     return register
 
 
-def plan_benchmark(
-    name: str, release: Release, agents: Sequence[str] = (), left_out: Collection[str] = ()
-) -> tuple[list[Cell], list[Missing]]:
+def plan_benchmark(name: str, release: Release, agents: Sequence[str] = ()) -> tuple[list[Cell], list[Missing]]:
     """The cells that a release has the data for, and what is missing for the others.
 
     Args:
       name: name of a registered benchmark.
       agents: names instead of the benchmark's own. B2 and B3 compare encoders: of these, they take those that have one
         of their own, beside BC without.
-      left_out: subsets that are there but that the user left out of `release`.
 
     Raises:
       DmcvbError: no such benchmark or agent.
     """
     benchmark, data = BENCHMARKS.get(name), SubsetFinder(release)
+    allow(agents, AGENTS)
     chosen = [parse_agent(agent) for agent in agents or benchmark.agents]
     if benchmark.compares_encoders:
         chosen = [agent for agent in chosen if agent.pretrain]
     cells = list(benchmark.cells(data, chosen))
-    return list(dict.fromkeys(cells)), data.missing(name, left_out)
+    return list(dict.fromkeys(cells)), data.missing(name)
 
 
 @register_benchmark("b1")
@@ -547,13 +515,6 @@ class FewEpisodes(Benchmark):
                     for agent in agents:
                         yield Cell(self.name, task, setting, agent, few, mixed)
 
-    def warnings(self, release, cells):
-        for name in dict.fromkeys(p.subset for cell in cells for p in cell.policy if p.episodes is not None):
-            there = len(release[name].episodes)
-            if there <= self.few:
-                text = f"b2 learns from {self.few} expert episodes, and {there} are all there are; roll out more"
-                yield Issue("learning", name, text)
-
 
 @register_benchmark("b3")
 class FixedGoals(Benchmark):
@@ -568,7 +529,7 @@ class FixedGoals(Benchmark):
         for task in mazes or [f"{ANT_MAZE}-empty7x7"]:
             for level in data.levels(task, FIXED) or ["expert"]:
                 fixed, hidden = data.find(task, [level], FIXED), data.parts(task, [level], HIDDEN)
-                for pair in data.pairs(fixed[0]) if fixed else ():
+                for pair in goal_pairs(data.release[fixed[0]]) if fixed else ():
                     ten = (Slice(fixed[0], goal_pair=pair),)
                     yield Cell(self.name, task, FIXED, parse_agent("bc"), ten)
                     for agent in agents if hidden else ():

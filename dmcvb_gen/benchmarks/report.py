@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.trainer import Budget
-from dmcvb_gen.benchmarks.cell import OwnAgent, default_threads, kept_results, open_data, planned_steps, run_cells
+from dmcvb_gen.benchmarks.cell import OwnAgent, kept_results, open_data, planned_steps, run_cells
 from dmcvb_gen.benchmarks.checks import (
     Results,
     Structure,
@@ -46,6 +46,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
+from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.release.issue import Issue
@@ -170,7 +171,7 @@ def make_budget(
         get_budget(profile).scaled(scale),
         device=device,
         precision=choose_precision(precision, device),
-        threads=threads or (default_threads(workers) if isinstance(workers, int) else 1),
+        threads=threads or (max(1, usable_cores() // workers) if isinstance(workers, int) else 1),
         memory=None if memory is None else int(memory * 1e9),
         **{name: str(value) if isinstance(value, Path) else value for name, value in fields.items()},
     )
@@ -206,8 +207,7 @@ def validate(
     release = open_data(path, budget)
     chosen, cells, missing = plan_validation(release, benchmarks, agents, patterns)
     if patterns:  # a subset that was not asked for is not missing
-        asked = [replace(one, subsets=tuple(n for n in one.subsets if matches(n, patterns))) for one in missing]
-        missing = [one for one in asked if one.subsets or one.left_out]
+        missing = [one for one in missing if any(matches(name, patterns) for name in one.subsets)]
     claim_folder(out, release, budget, training=bool(cells))
     structure = check_structure(chosen, budget.backgrounds, progress.checking, workers)
     results: list[tuple[Cell, dict[str, Any]]] = []
@@ -215,7 +215,7 @@ def validate(
         progress.total(planned_steps(budget, cells))
         for cell, result in run_cells(path, out, budget, cells, workers, progress.training):
             progress.done(cell, result)
-            results.append((cell, {key: value for key, value in result.items() if key != "kept"}))
+            results.append((cell, result))
         results.sort(key=lambda pair: cells.index(pair[0]))
     known = {cell for cell, _ in results}
     shown = [*results, *((cell, result) for cell, result in kept_results(release, out, budget) if cell not in known)]
@@ -243,11 +243,10 @@ def plan_validation(
     cells: list[Cell] = []
     missing: list[Missing] = []
     for name in dict.fromkeys(benchmarks):
-        found, lacking = plan_benchmark(name, chosen, agents, release.subsets.keys() - chosen.subsets.keys())
+        found, lacking = plan_benchmark(name, chosen, agents)
         if not found:
-            needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking if m.subsets]
-            needs += [f"let --only take {', '.join(m.left_out[:4])}" for m in lacking if m.left_out]
-            cure = "; ".join(needs) or "roll out a locomotion task"
+            needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking] or ["roll out another task"]
+            cure = "let --only take more subsets" if patterns else "; ".join(needs)
             raise DmcvbError(f"benchmark {name} has no data in {chosen.place}; {cure}")
         cells += found
         missing += lacking
@@ -476,7 +475,7 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
         groups=_groups(facts),
         comparison=_comparison(facts["comparison"]),
         notes=_notes(facts),
-        missing=_missing(facts["missing"]),
+        missing=[(m["benchmark"], ", ".join(m["subsets"]), m["command"]) for m in facts["missing"]],
     )
 
 
@@ -492,26 +491,18 @@ def _score_row(row: Mapping[str, Any]) -> list[str]:
 
 
 def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
-    found, failed = len(facts["structure"]["findings"]), len(facts["failed"])
     checked = ", ".join(pluralize(count, what) for what, count in facts["structure"]["checked"].items())
-    there, asked = facts["episodes"]["there"], facts["episodes"]["asked"]
-    if not facts["sound"]:
-        kind = "unsound"
-        text = f"Not sound: {pluralize(found, 'findings')}"
-        text += (f", {pluralize(failed, 'cells')} failed" if failed else "") + f" in {checked}."
-    elif not facts["complete"]:
-        kind, text = "incomplete", f"Incomplete: {there:,} of {asked:,} episodes. Sound is what is there: {checked}."
+    if facts["sound"]:
+        text = f"All checks passed ({checked})."
     else:
-        kind, text = "sound", f"Sound: {checked}."
-    if kind == "unsound" and not facts["complete"]:
-        text += f" Incomplete: {there:,} of {asked:,} episodes."
+        found, failed = len(facts["structure"]["findings"]), len(facts["failed"])
+        text = f"Checks failed: {pluralize(found, 'findings')}, {pluralize(failed, 'failed cells')} ({checked})."
+    if not facts["complete"]:
+        text += " Incomplete: {there:,} of {asked:,} episodes.".format(**facts["episodes"])
     if facts["cells_planned"]:
-        done, name = len(facts["results"]), facts["budget"]["name"]
-        text += f" {done} of {facts['cells_planned']} benchmark cells run [{name}]."
-    else:
-        text += " The data were checked; no agent was trained."
+        text += f" {len(facts['results'])} of {facts['cells_planned']} benchmark cells run [{facts['budget']['name']}]."
     text += f" {pluralize(len(facts['warnings']), 'warnings')}." if facts["warnings"] else ""
-    return {"kind": kind, "text": text}
+    return {"kind": ("sound" if facts["complete"] else "incomplete") if facts["sound"] else "unsound", "text": text}
 
 
 def _checks(findings: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, int]]:
@@ -624,28 +615,19 @@ def _comparison(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, l
 def _notes(facts: Mapping[str, Any]) -> list[str]:
     """Return the notes that a reader of the scores needs."""
     results = facts["results"]
-    most = max((result["evaluations"] for result in results), default=1)
-    kind = "of the trained policy" if most == 1 else f"the best of {most} over a training, as in the paper"
-    notes = [f"A score is an online evaluation {kind}: mean and standard error over its episodes."]
+    notes = ["A score is the mean return of an online evaluation, with its standard error."]
+    if any(result["evaluations"] > 1 for result in results):
+        notes.append("Of several evaluations in a training the best one counts, as in the paper.")
     for evaluated, data in sorted({(r["score"]["limit"], r["data"]["limit"]) for r in results}):
-        text = f"Evaluations are cut at {evaluated:,} agent steps, "
-        unlike = f"the data at {data:,}: their returns cannot be compared where the end is not reached before."
-        notes.append(text + ("as the data are." if evaluated == data else unlike))
-    pictured = [result for result in results if "size" in result["evaluation"]]
-    if pictured:
-        others = ", agents that see states in float32" if len(pictured) < len(results) else ""
-        notes.append(f"Networks that see images computed in {facts['budget']['precision']}{others}.")
-    for data, evaluation in sorted({(r["renderers"]["data"], r["renderers"]["evaluation"]) for r in pictured}):
+        notes.append(f"Evaluations are cut at {evaluated:,} agent steps, the data at {data:,}.")
+    seen = [result["renderers"] for result in results if "size" in result["evaluation"]]
+    for data, evaluation in sorted({(each["data"], each["evaluation"]) for each in seen}):
         if data != evaluation:
-            notes.append(
-                f"The data were painted elsewhere ({data}), the evaluations here by renderer {evaluation}: agents with "
-                "images are scored on other images than they learned from."
-            )
+            text = f"The data were rendered elsewhere ({data}), the evaluations by renderer {evaluation}: agents with "
+            notes.append(text + "images are scored on other images than they learned from.")
     if any(result["score"]["success"] is not None for result in results):
-        notes.append(
-            "Success is the share of episodes that reach the goal; the speed is the distance to the goal at the start "
-            "over the time to reach it, of those episodes."
-        )
+        notes.append("Success is the share of episodes that reach the goal.")
+        notes.append("Speed is the distance to the goal at the start over the time that such episodes take.")
     return notes
 
 
@@ -674,16 +656,6 @@ def _sheets(good: Results, folder: Path, kind: str) -> dict[str, Any]:
             caption += f"[{result['budget']['name']}]"
         found.append({"caption": caption, "source": data_url(path.read_bytes())})
     return {"shown": found, "more": len(there) - len(found), "names": f"cells/*.{kind}.png"}
-
-
-def _missing(entries: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    rows = []
-    for entry in entries:
-        if entry["subsets"]:
-            rows.append((entry["benchmark"], ", ".join(entry["subsets"]), entry["command"]))
-        if entry["left_out"]:
-            rows.append((entry["benchmark"], ", ".join(entry["left_out"]), "in the release, left out by --only"))
-    return rows
 
 
 # -- figures ----------------------------------------------------------------------------------------

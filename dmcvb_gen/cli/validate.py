@@ -12,6 +12,7 @@ from dmcvb_gen import commands
 from dmcvb_gen.cli.common import answer
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.cli.unused_options import refuse
+from dmcvb_gen.own_code import is_own
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import pluralize
 
@@ -43,7 +44,7 @@ def validate(own, strict, as_json, **options):
 
 
 def _show_score(budget, cell, facts) -> None:
-    """A cell's score, as soon as it is there, and whether it is one of an earlier run by a user's own code."""
+    """Print a cell's score as soon as it is known."""
     if "error" in facts:
         return  # told at the end, where it is not overlooked
     score, paper = facts["score"], facts["paper"]
@@ -54,20 +55,14 @@ def _show_score(budget, cell, facts) -> None:
     score = f"{score['mean']:.1f} +- {score['stderr']:.1f} [{budget.name}]"
     with ProgressBar.external_write_mode():
         click.echo(f"{cell.place} {cell.agent.name}: {score}{goal}{beside}")
-        if facts.get("kept"):
-            click.echo(
-                "  This is the score of an earlier run, as the code is the same; to train again, delete "
-                f"cells/{cell.id}.json beside the report."
-            )
 
 
 def _agents(names: tuple[str, ...] | None, own: tuple[str, ...], benchmarks: tuple[str, ...]) -> list[str]:
     """The agents asked for; one's own alone are set beside BC from states, in benchmarks that take it."""
-    from dmcvb_gen.agents.catalog import OWN
     from dmcvb_gen.benchmarks.plan import BENCHMARKS
 
     for name in own:
-        if not OWN.fullmatch(name):
+        if not is_own(name):
             raise click.UsageError(f"--agent {name} is not MODULE:NAME; the paper's agents are chosen with --agents.")
     beside = own and not names and any(not BENCHMARKS.get(name).compares_encoders for name in benchmarks)
     return [*(names or ()), *(["state-bc"] if beside else []), *own]
@@ -79,11 +74,7 @@ def _validated(result, budget) -> Iterator[str]:
     yield from (f"FAIL {cell.id}: {error}" for cell, error in result.failed)
     yield from (f"warning: {finding}" for finding in result.warnings)
     for entry in result.missing:
-        if entry.subsets:
-            names = ", ".join(entry.subsets)
-            yield f"{entry.benchmark}: not in the release: {names}; to get them: {entry.command}"
-        if entry.left_out:
-            yield f"{entry.benchmark}: left out by --only: {', '.join(entry.left_out)}"
+        yield f"{entry.benchmark}: not in the release: {', '.join(entry.subsets)}; to get them: {entry.command}"
     checked = ", ".join(pluralize(count, name) for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
     verdict = ["sound" if result.sound else pluralize(found, "findings")]

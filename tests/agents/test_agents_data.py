@@ -313,17 +313,6 @@ def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to():
     assert rates == {True: pytest.approx([1e-3, 0.75e-3, 0.5e-3, 0.25e-3]), False: [1e-3] * 4}
 
 
-def test_a_rate_is_a_factor_of_the_learners_own_of_those_that_see_pictures():
-    data, budget = make_data(), dataclasses.replace(SHORT, rate=3.0)
-    for learner, seen, expected in (
-        (pixel_learner(data), data, 3e-3),
-        (state_learner(data.states_only()), data.states_only(), 1e-3),
-    ):
-        [group], rates = learner.optimizers["main"].param_groups, []
-        train(learner, seen, budget, 2, tick=lambda steps, group=group, rates=rates: rates.append(group["lr"]))
-        assert rates == [pytest.approx(expected)] * 2 and group["lr"] == 1e-3
-
-
 def test_a_damaged_state_is_refused_with_what_to_do(tmp_path):
     data = make_data().states_only()
     (tmp_path / trainer.RESUME_FILE).write_bytes(b"cut short")

@@ -8,7 +8,6 @@ import sys
 
 import pytest
 
-from dmcvb_gen.benchmarks import cell
 from dmcvb_gen.parallel import cores
 
 
@@ -19,7 +18,7 @@ def test_the_fewer_of_affinity_and_container_count(tmp_path, monkeypatch, limit,
     if limit:
         (tmp_path / "cpu.max").write_text(limit + "\n")
     assert cores.usable_cores() == wanted
-    assert cell.default_workers("cpu") * cell.default_threads(cell.default_workers("cpu")) <= wanted
+    assert [cores.default_workers(most) for most in (0, 2, 100)] == [1, min(2, wanted), wanted]
 
 
 def test_a_system_without_affinities_gives_all_cores(tmp_path, monkeypatch):
