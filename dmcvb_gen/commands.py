@@ -232,7 +232,7 @@ def validate(
       release (RELEASE): Folder of the release.
       profile: Budget: smoke (no scores), brief, quick or paper.
       scale: Multiply the profile's steps.
-      benchmarks: b1, b2, b3, ablations.
+      benchmarks: b1, b2, b3, b4, ablations.
       agents (A,B): Agents to train, e.g. bc,state-bc,id+bc. [default: the benchmark's]
       only (PATTERN): Use only these subsets, e.g. 'walker-walk/expert/*'.
       out (FOLDER): Folder of the report. [default: reports/NAME]

@@ -256,6 +256,7 @@ class TrainingData:
         next_observation: bool = False,
         k: int = 1,
         sample_k: bool = False,
+        later: bool = False,
         hold_out: bool = False,
         shift: bool = True,
         **options: Any,
@@ -265,6 +266,7 @@ class TrainingData:
         Args:
           next_observation: give the observation k steps later too, under the same shift.
           k: steps between the two; with `sample_k` drawn from 1..k for each.
+          later: the next observation is one step later, and the one k steps later is given besides.
           hold_out: draw from the held-out episodes, without shifts.
           shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
           options: dtype, reuse and pictures of `transitions`.
@@ -285,7 +287,7 @@ class TrainingData:
         if next_observation:
             drawn = generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k)
             steps = self._to_device(drawn)
-        return self.transitions(rows[self._to_device(index)], steps, down, right, **options)
+        return self.transitions(rows[self._to_device(index)], steps, down, right, later=later, **options)
 
     def transitions(
         self,
@@ -296,6 +298,7 @@ class TrainingData:
         dtype: torch.dtype = torch.float32,
         reuse: Batch | None = None,
         pictures: bool = True,
+        later: bool = False,
     ) -> Batch:
         """The transitions of given rows.
 
@@ -306,12 +309,16 @@ class TrainingData:
           reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
             memory for a large batch costs several times the work that fills it.
           pictures: give observations even if the data are encoded.
+          later: see `batch`.
         """
-        now = later = None
+        now = following = last = None
         if pictures or self.latent is None:
             now = self.observe(rows, down, right, dtype, reuse and reuse.observation)
             if steps is not None:
-                later = self.observe(rows + steps, down, right, dtype, reuse and reuse.next_observation)
+                after = rows + (1 if later else steps)
+                following = self.observe(after, down, right, dtype, reuse and reuse.next_observation)
+            if later:
+                last = self.observe(rows + steps, down, right, dtype, reuse and reuse.later_observation)
         latent = self.latent
         return Batch(
             observation=now,
@@ -319,7 +326,8 @@ class TrainingData:
             action=self.action[rows],
             reward=self.reward[rows],
             discount=self.discount[rows],
-            next_observation=later,
+            next_observation=following,
+            later_observation=last,
             k=steps,
             latent=None if latent is None else latent[rows],
             next_latent=None if latent is None or steps is None else latent[rows + steps],

@@ -32,7 +32,8 @@ class Batch:
     """Transitions; tensors with leading axis (batch,).
 
     Attributes:
-      observation, next_observation: what the agent sees at t and t + k; None if nobody asks for it.
+      observation, next_observation: what the agent sees at t and t + k; None if it is not asked for.
+      later_observation: at t + k, if next_observation is that of t + 1 (`Learner.needs_later`); None elsewhere.
       state: (batch, state) normalized state at t.
       action: (batch, action) in [-1, 1].
       reward, discount: (batch,) of the action at t; discount 0 if the task ended the episode.
@@ -46,6 +47,7 @@ class Batch:
     reward: torch.Tensor
     discount: torch.Tensor
     next_observation: torch.Tensor | None = None
+    later_observation: torch.Tensor | None = None
     k: torch.Tensor | None = None
     latent: torch.Tensor | None = None
     next_latent: torch.Tensor | None = None
@@ -83,6 +85,8 @@ class Learner(nn.Module, abc.ABC):
 
     needs_next = False
     """Whether batches need `next_observation`."""
+    needs_later = False
+    """Whether they need `later_observation`, too."""
     needs_pictures = True
     """Whether batches need observations even if they hold the latents of a frozen encoder."""
     k_max, sample_k = 1, False

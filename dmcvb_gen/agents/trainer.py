@@ -133,6 +133,7 @@ def draw(
         next_observation=learner.needs_next,
         k=learner.k_max,
         sample_k=learner.sample_k,
+        later=learner.needs_later,
         hold_out=hold_out,
         shift=shift,
         dtype=torch.bfloat16 if learner.half else torch.float32,

@@ -38,6 +38,7 @@ from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pret
 from dmcvb_gen.agents.data import Normalization, TrainingData, choose_episodes, default_memory, load_data
 from dmcvb_gen.agents.learners import Learner, Policy
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
+from dmcvb_gen.agents.probe import action_probe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
 from dmcvb_gen.benchmarks.evaluate import Act, Evaluator, Score, TrainedAgent, protocol, renderer_choice
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
@@ -50,10 +51,11 @@ from dmcvb_gen.loaders.sampler import StepSource
 from dmcvb_gen.own_code import AGENTS, find_function, source_digest
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, cores, ignore, open_pool
 from dmcvb_gen.policies.evaluation import goal_speed
+from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
 
-RESULT_VERSION = 4
+RESULT_VERSION = 5
 INSPECTED = 150_000
 """Held-out transitions that an inspection's error is the mean of, at most (the paper's number)."""
 UNIT_EPISODES = 100
@@ -344,7 +346,8 @@ class CellRun:
         curve = self._fit(learner, data, steps, budget.shifts(steps, len(data)), label)
         with replacing(self.path(".safetensors")) as path:
             save_file({name: value.cpu().contiguous() for name, value in encoder.state_dict().items()}, str(path))
-        return {"curve": curve, "seconds": curve[-1]["seconds"]}
+        probe = action_probe(learner, data) if hasattr(learner, "latent_action") else None
+        return {"curve": curve, "seconds": curve[-1]["seconds"], "action_probe": probe}
 
     def _train(self) -> dict[str, Any]:
         """Train a policy, score it and look into its encoder."""
@@ -366,7 +369,7 @@ class CellRun:
         inspection = self.inspect(policy.encoder, data) if pixels and budget.readout_steps else None
         looking = sum(points[-1]["seconds"] for points in inspection["curves"].values()) if inspection else 0.0
         return self._facts(data, curve, looking) | {
-            "pretraining": pretrained and {key: pretrained[key] for key in ("curve", "seconds")},
+            "pretraining": pretrained and {key: pretrained[key] for key in ("curve", "seconds", "action_probe")},
             "inspection": inspection,
         }
 
@@ -458,6 +461,7 @@ class CellRun:
         return {
             "labels": {"policy": cell.policy_label, "encoder": cell.pretrain_label},
             "score": best["score"] | {"step": best["step"]},
+            "normalized": normalized_return(self.release, cell, best["score"]),
             "final": evaluations[-1]["score"],
             "evaluations": len(evaluations),
             "paper": paper and {"mean": paper[0], "stderr": paper[1]},
@@ -551,6 +555,24 @@ def data_score(subset: Subset, data: TrainingData) -> Score:
         reached = (data.discount[torch.as_tensor(ends - 1, device=data.device)] == 0).cpu().numpy()
         success, speed = float(reached.mean()), goal_speed(distance, data.lengths, reached, task)
     return Score.of(data.returns, success=success, speed=speed, limit=subset.record.max_steps)
+
+
+def normalized_return(release: Release, cell: Cell, score: dict[str, Any]) -> float | None:
+    """The score on a scale on which random actions have 0 and the expert data 100; None if there is no such scale.
+
+    The ends are the mean returns of the release's random and expert data, or else of the paper's. Episodes that were
+    cut elsewhere than the data's have other returns, as those of mazes.
+    """
+    ends, limit = [], release[cell.policy[0].subset].record.max_steps
+    for level in ("random", "expert"):
+        subsets = [s for s in release.subsets.values() if (s.task, s.level) == (cell.task, level)]
+        paper = paper_returns(cell.task, level)
+        if not subsets and not paper:
+            return None
+        ends.append(float(subsets[0].returns.mean()) if subsets else paper["mean"])
+    if score["limit"] != limit or not ends[0] < ends[1]:
+        return None
+    return 100 * (score["mean"] - ends[0]) / (ends[1] - ends[0])
 
 
 def state_units(release: Release, task: str) -> torch.Tensor:

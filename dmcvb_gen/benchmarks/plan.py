@@ -568,3 +568,38 @@ class Ablations(Benchmark):
                 shares = [share for count, share in counts.items() if count < episodes]
                 for share, agent in itertools.product(shares, by_pictures):
                     yield Cell(self.name, task, setting, agent, (Slice(parts[0].subset, share=share),))
+
+
+@register_benchmark("b4")
+class LabelBudgets(Benchmark):
+    """Latent actions of all expert images decoded by few labeled episodes, beside BC on those and on all.
+
+    The protocol of LAOM (Nikulin et al. 2025). The seed of the trainings draws the episodes; a smaller budget is a part
+    of a larger one, whatever the agent, so scores of one budget are of the same labels.
+    """
+
+    title = "B4: label budgets, latent actions from all images and few labeled episodes"
+    agents = ("lapo+bc", "laom+bc")
+    compares_encoders = True
+    budgets = (2, 8, 32, 128)
+
+    def cells(self, data, agents):
+        bc = parse_agent("bc")
+        for task in data.tasks:
+            for setting in [VISIBLE] if is_maze(task) else data.settings(task):
+                whole = data.parts(task, ["expert"], setting)
+                if not whole:
+                    continue
+                yield Cell(self.name, task, setting, bc, whole)  # scores are shares of this one
+                there = len(data.release[whole[0].subset].episodes)
+                for budget in [budget for budget in self.budgets if budget < there]:
+                    labeled = (Slice(whole[0].subset, episodes=budget),)
+                    yield Cell(self.name, task, setting, bc, labeled)
+                    for agent in agents:
+                        yield Cell(self.name, task, setting, agent, labeled, whole)
+
+    def reference(self, cell):
+        return "BC on all labels"
+
+    def is_reference(self, other, cell):
+        return other.agent.name == "bc" and (other.setting, other.policy_label) == (cell.setting, "expert")

@@ -75,8 +75,6 @@ CHECKS = {
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""
 SHOWN = 200
 """Findings on the page; the JSON file has all."""
-SHEETS = 60
-"""Pictures of each kind on the page, which holds them; the others lie beside the cells."""
 MARKUP = {ord(mark): f"&#{ord(mark)};" for mark in "|\\*_`"}
 """Written as entities, they mean nothing to any reader of Markdown."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
@@ -501,6 +499,8 @@ def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
         text += " Incomplete: {there:,} of {asked:,} episodes.".format(**facts["episodes"])
     if facts["cells_planned"]:
         text += f" {len(facts['results'])} of {facts['cells_planned']} benchmark cells run [{facts['budget']['name']}]."
+    else:
+        text += " The data were checked; no agent was trained."
     text += f" {pluralize(len(facts['warnings']), 'warnings')}." if facts["warnings"] else ""
     return {"kind": ("sound" if facts["complete"] else "incomplete") if facts["sound"] else "unsound", "text": text}
 
@@ -517,11 +517,16 @@ def _listed(findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _returns(returns: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    rows = []
+    """A row for the settings of a task and level whose returns are the same, as those of shared trajectories are."""
+    alike: dict[tuple, list[str]] = {}
     for name, values in returns.items():
-        rows.append([name, *(f"{values[key]:.1f}" for key in STATISTICS)])
-        if values["paper"]:
-            rows.append(["the paper", *(f"{values['paper'][key]:.1f}" for key in STATISTICS)])
+        place, _, setting = name.rpartition("/")
+        paper = values["paper"] and tuple(values["paper"][key] for key in STATISTICS)
+        alike.setdefault((place, tuple(values[key] for key in STATISTICS), paper), []).append(setting)
+    rows = []
+    for (place, ours, paper), settings in alike.items():
+        found = [(f"{place}/{', '.join(settings)}", ours), *([(f"the paper's {place}", paper)] if paper else [])]
+        rows += [[name, *(f"{value:.1f}" for value in values)] for name, values in found]
     return {"head": ("subset", *STATISTICS), "rows": rows}
 
 
@@ -560,9 +565,13 @@ def _score_lines(result: Mapping[str, Any], budget: Mapping[str, Any]) -> list[s
     elif result["difference"] and budget["scores"]:  # 0 is the reference itself
         side = "above" if result["difference"] > 0 else "below"
         lines.append(f"{_number(abs(result['difference']))} {side} {result['reference']}")
+    if result["normalized"] is not None and budget["scores"]:
+        lines.append(f"normalized {result['normalized']:.0f}")
     lines += _goal_lines(score)
     if result["labels"]["encoder"]:
         lines.append(f"encoder: {result['labels']['encoder']}")
+    if (result["pretraining"] or {}).get("action_probe") is not None:
+        lines.append(f"probe misses {100 * result['pretraining']['action_probe']:.0f} % of the actions' variance")
     return lines
 
 
@@ -642,20 +651,20 @@ def _inspection(good: Results, budget: str) -> list[tuple]:
     return rows
 
 
-def _sheets(good: Results, folder: Path, kind: str) -> dict[str, Any]:
+def _sheets(good: Results, folder: Path, kind: str) -> list[dict[str, str]]:
     """Pictures that cells left: "rollout" or "decoder"."""
-    seeing = [(cell, result) for cell, result in good if not cell.agent.sees_state]
-    paths = [folder / "cells" / f"{cell.id}.{kind}.png" for cell, _ in seeing]
-    there = [(*pair, path) for pair, path in zip(seeing, paths, strict=True) if path.exists()]
     found = []
-    for cell, result, path in there[:SHEETS]:
+    for cell, result in good:
+        path = folder / "cells" / f"{cell.id}.{kind}.png"
+        if not path.exists():
+            continue
         caption = f"{cell.label} on {cell.place}"
         if kind == "rollout":
             returns = result["final"]["returns"]
             caption += f": first of {len(returns)} episodes of the last evaluation, return {_number(returns[0])} "
             caption += f"[{result['budget']['name']}]"
         found.append({"caption": caption, "source": data_url(path.read_bytes())})
-    return {"shown": found, "more": len(there) - len(found), "names": f"cells/*.{kind}.png"}
+    return found
 
 
 # -- figures ----------------------------------------------------------------------------------------

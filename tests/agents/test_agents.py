@@ -13,9 +13,10 @@ from safetensors.torch import save_file
 from dmcvb_gen.agents.catalog import agent_names, make_encoder, make_policy, make_pretrainer, parse_agent
 from dmcvb_gen.agents.data import Sizes
 from dmcvb_gen.agents.dino import DinoEncoder
-from dmcvb_gen.agents.learners import Batch, move_towards
+from dmcvb_gen.agents.laom import LatentActionObservationModel
+from dmcvb_gen.agents.lapo import CODE_WIDTH, LatentActionPolicy
+from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.agents.networks import (
-    MLP,
     PAPER,
     PATCHES,
     Architecture,
@@ -34,6 +35,7 @@ from dmcvb_gen.agents.paper import (
     StatePrediction,
     StateProbe,
 )
+from dmcvb_gen.agents.probe import linear_probe
 from dmcvb_gen.agents.td3_bc import TD3BC
 from dmcvb_gen.agents.trainer import Budget, train
 from dmcvb_gen.benchmarks.plan import BUDGETS
@@ -58,6 +60,7 @@ def make_batch(count=8, seed=0, k=1):
         reward=uniform(count) + 0.5,
         discount=torch.ones(count),
         next_observation=uniform(count, CHANNELS, SIZE, SIZE),
+        later_observation=uniform(count, CHANNELS, SIZE, SIZE),
         k=torch.full((count,), k),
     )
 
@@ -96,13 +99,6 @@ def test_the_encoder_has_the_papers_sizes(channels, first):
     assert latent.shape == (2, 64) and latent.abs().max() < 1
 
 
-def test_the_decoder_is_the_encoder_in_reverse():
-    decoder = ObservationDecoder(9)
-    kernels = 256 * 128 * 9 + 128 + 128 * 64 * 9 + 64 + 64 * 32 * 9 + 32 + 32 * 9 * 9 + 9
-    assert parameters(decoder) == 64 * 65_536 + 65_536 + kernels
-    assert decoder(torch.zeros(2, 64)).shape == (2, 9, 64, 64)
-
-
 @pytest.mark.parametrize("size", [16, 47, 50, 64])
 @pytest.mark.parametrize("architecture", [PAPER, PATCHES, Architecture((4, 8, 8, 16), (2, 2, 2, 1))])
 def test_pictures_of_any_size_are_encoded_and_decoded_to_that_size(size, architecture):
@@ -111,14 +107,6 @@ def test_pictures_of_any_size_are_encoded_and_decoded_to_that_size(size, archite
     assert encoder.body(pictures).shape == (2, encoder.body.features)
     decoder = ObservationDecoder(9, size, encoder.features, architecture)
     assert decoder(encoder(pictures)).shape == pictures.shape
-
-
-def test_state_networks_and_heads_have_the_papers_sizes():
-    assert parameters(state_encoder(24)) == 24 * 64 + 64 + 2 * 64
-    head = 64 * 256 + 256 + 256 * 256 + 256
-    assert parameters(MLP(64, 6, tanh=True)) == head + 256 * 6 + 6
-    assert parameters(state_decoder(24)) == head + 256 * 24 + 24
-    assert state_decoder(24)(torch.full((1, 64), 1e3)).abs().max() > 1  # states are not bounded
 
 
 def test_weights_start_orthogonal():
@@ -136,16 +124,13 @@ def test_inverse_dynamics_embeds_k_only_where_it_is_sampled(sample):
     assert same is not sample
 
 
-def test_td3s_critics_are_bounded_as_the_papers_unless_it_is_asked_otherwise():
-    """The hyperparameter table: "Actor, Critic 1 and Critic 2", "Last layer activation", "tanh"."""
-    values = {}
-    for bounded in (True, False):
-        learner = TD3BC(None, STATE_SIZES, unbounded=not bounded)
+def test_td3s_critics_are_bounded_unless_it_is_asked_otherwise():
+    for unbounded in (False, True):
+        learner = TD3BC(None, STATE_SIZES, unbounded=unbounded)
         for critic in (learner.net.critic1, learner.net.critic2):
             torch.nn.init.constant_(last_linear(critic).bias, 150.0)
-        values[bounded] = torch.stack(learner.net.values(torch.zeros(3, STATES), torch.zeros(3, ACTIONS)))
-    assert values[True].shape == (2, 3) and values[True].abs().max() <= 1
-    assert values[False].min() > 100
+        values = torch.stack(learner.net.values(torch.zeros(3, STATES), torch.zeros(3, ACTIONS)))
+        assert values.min() > 100 if unbounded else values.abs().max() <= 1
 
 
 def test_td3s_values_are_finer_than_half_precision():
@@ -330,6 +315,8 @@ MOVED = {
     "lfd": (lambda: LatentForwardDynamics(small_encoder(), SIZES), ("encoder", "embed_action", "g.", "target_")),
     "ae": (lambda: Autoencoder(small_encoder(), SIZES), ("encoder", "psi")),
     "state": (lambda: StatePrediction(small_encoder(), SIZES), ("encoder", "h.")),
+    "lapo": (lambda: LatentActionPolicy(small_encoder(), SIZES), ("encoder", "see", "f.", "g.")),
+    "laom": (lambda: LatentActionObservationModel(small_encoder(), SIZES), ("encoder", "see", "f.", "g.", "target")),
     "observation readout": (lambda: ObservationProbe(small_encoder(), SIZES), ("psi",)),
     "state readout": (lambda: StateProbe(small_encoder(), SIZES), ("h.",)),
     "td3-bc, critics first": (td3, ("net.critic1", "net.critic2")),
@@ -343,25 +330,17 @@ def test_one_update_moves_exactly_the_parameters_that_the_paper_says(kind):
     assert moved(learner) == names(learner, *prefixes)
 
 
-def test_td3_bc_moves_convolutions_and_both_trunks_by_the_actors_loss_alone():
+def test_td3_bcs_critics_learn_with_their_heads_alone_and_the_actor_leaves_those():
     learner = td3()
-    by_critic = {id(p) for group in learner.optimizers["critic"].param_groups for p in group["params"]}
     heads = [*learner.net.critic1.parameters(), *learner.net.critic2.parameters()]
-    assert by_critic == {id(p) for p in heads}
-    critic = learner.critic_loss(make_batch())
-    critic.backward()
+    learner.critic_loss(make_batch()).backward()
     reached = {name for name, p in learner.net.named_parameters() if p.grad is not None}
     assert {name.split(".")[0] for name in reached} == {"critic1", "critic2"}
-    learner.zero_grad(set_to_none=True)
-    learner.actor_loss(make_batch())[0].backward()
-    reached = {name.split(".")[0] for name, p in learner.net.named_parameters() if p.grad is not None}
-    assert {"body", "actor_trunk", "critic_trunk", "actor"} <= reached
     before = [p.clone() for p in heads]
     learner._descend("actor", learner.actor_loss(make_batch())[0])
     assert all(torch.equal(old, new) for old, new in zip(before, heads, strict=True))
     second = moved(learner, 2)  # the second update is the actor's turn
-    assert names(learner, "net.body", "net.actor_trunk", "net.critic_trunk", "net.actor") <= second
-    assert {name for name in second if name.startswith("target")}, "targets follow"
+    assert names(learner, "net.body", "net.actor_trunk", "net.critic_trunk", "net.actor", "target") <= second
 
 
 def test_td3_bc_on_a_frozen_encoder_leaves_it_alone():
@@ -372,17 +351,65 @@ def test_td3_bc_on_a_frozen_encoder_leaves_it_alone():
     assert "net.actor.0.weight" in moved(learner, 2)
 
 
+# -- latent actions -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [LatentActionPolicy, LatentActionObservationModel])
+def test_latent_actions_learn_from_images_alone_and_the_policy_from_latent_actions(kind):
+    learner, batch = kind(small_encoder(), SIZES), make_batch()
+    losses = learner.losses(batch)
+    losses["policy"].backward(retain_graph=True)
+    reached = {name.split(".")[0] for name, p in learner.named_parameters() if p.grad is not None}
+    assert reached == {"encoder"}
+    learner.zero_grad(set_to_none=True)
+    losses["model"].backward()
+    reached = {name.split(".")[0] for name, p in learner.named_parameters() if p.grad is not None}
+    assert reached == {"see", "f", "g"}
+    blind = dataclasses.replace(batch, action=batch.action + 9, state=batch.state + 9, reward=batch.reward + 9)
+    torch.manual_seed(0)
+    learner = kind(small_encoder(), SIZES)
+    assert torch.equal(learner.metrics(blind)["loss"], learner.metrics(batch)["loss"])
+
+
+def test_lapos_latent_actions_are_replaced_by_the_nearest_codes_which_move_to_them():
+    learner = LatentActionPolicy(small_encoder(), SIZES)
+    learner.codes.fill_(9.0)
+    learner.codes[3], learner.codes[5] = 0.5, -0.5
+    learner.sums.copy_(learner.codes)
+    z = torch.cat([torch.full((1, CODE_WIDTH), 0.4), torch.full((1, CODE_WIDTH), -0.7)], dim=1).requires_grad_()
+    with torch.no_grad():
+        assert learner.quantize(z)[0].tolist() == [[0.5] * CODE_WIDTH + [-0.5] * CODE_WIDTH]
+        assert learner.codes[3, 0] == 0.5  # a test loss moves no code
+    codes, distance = learner.quantize(z)
+    assert distance.item() == pytest.approx((0.1**2 + 0.2**2) / 2)
+    codes.sum().backward()
+    assert torch.equal(z.grad, torch.ones_like(z))
+    moved = (0.999 * 0.5 + 0.001 * 0.4) / (0.999 + 0.001)
+    assert learner.codes[3, 0].item() == pytest.approx(moved) and learner.codes[7, 0].item() == pytest.approx(9.0)
+
+
+def test_laoms_inverse_model_sees_the_later_observation_and_its_model_the_next_one():
+    learner, batch = LatentActionObservationModel(small_encoder(), SIZES), make_batch()
+    loss = learner.metrics(batch)["model"]
+    other = make_batch(seed=1)
+    for name in ("next_observation", "later_observation"):
+        assert learner.metrics(dataclasses.replace(batch, **{name: getattr(other, name)}))["model"] != loss
+    before = learner.latent_action(batch)
+    same = learner.latent_action(dataclasses.replace(batch, later_observation=other.later_observation))
+    assert torch.equal(before, same)  # it is labeled by one step
+
+
+def test_a_linear_probe_of_latent_actions_that_know_the_answer():
+    generator = torch.Generator().manual_seed(0)
+    action, noise = (torch.rand((400, 2), generator=generator) - 0.5 for _ in range(2))
+    mixed = torch.cat([action, noise], dim=1) @ torch.randn((4, 4), generator=generator) + 3
+    for latent, missed in ((mixed, 0.0), (noise, 1.0), (torch.cat([action[:, :1], noise], dim=1), 0.5)):
+        found = linear_probe(latent[:300], action[:300], latent[300:], action[300:])
+        assert found == pytest.approx(missed, abs=0.06)
+    assert linear_probe(mixed[:300], action[:300], mixed[300:], action[300:] + 1) == pytest.approx(12, rel=0.2)
+
+
 # -- targets by hand ------------------------------------------------------------------------------
-
-
-def test_a_target_moves_a_hundredth_of_the_way():
-    old, new = torch.nn.Linear(1, 1, bias=False), torch.nn.Linear(1, 1, bias=False)
-    old.weight.data.fill_(1.0)
-    new.weight.data.fill_(3.0)
-    move_towards(old, new)
-    assert old.weight.item() == pytest.approx(0.99 * 1 + 0.01 * 3)
-    move_towards(old, new)
-    assert old.weight.item() == pytest.approx(0.99 * 1.02 + 0.01 * 3)
 
 
 def test_lfds_target_is_an_average_of_the_encoders():
@@ -399,25 +426,6 @@ def test_lfds_target_is_an_average_of_the_encoders():
 def constant(mlp, value):
     torch.nn.init.zeros_(last_linear(mlp).weight)
     torch.nn.init.constant_(last_linear(mlp).bias, value)
-
-
-def test_td3s_target_value_by_hand():
-    learner = TD3BC(None, STATE_SIZES, unbounded=True)
-    constant(learner.target.critic1, 5.0)
-    constant(learner.target.critic2, 3.0)
-    batch = Batch(
-        observation=torch.zeros(2, STATES),
-        state=torch.zeros(2, STATES),
-        action=torch.zeros(2, ACTIONS),
-        reward=torch.tensor([1.0, 2.0]),
-        discount=torch.tensor([1.0, 0.0]),
-        next_observation=torch.zeros(2, STATES),
-    )
-    torch.testing.assert_close(learner.target_value(batch), torch.tensor([1.0 + 0.99 * 3.0, 2.0]))
-    loss = learner.critic_loss(batch)
-    constant(learner.net.critic1, 0.0)
-    constant(learner.net.critic2, 0.0)
-    assert learner.critic_loss(batch).item() == pytest.approx(2 * ((1 + 2.97) ** 2 + 2**2) / 2) and loss.isfinite()
 
 
 def test_td3s_policy_noise_and_the_noisy_action_are_clipped(monkeypatch):
@@ -440,7 +448,11 @@ def test_td3_bc_makes_the_steps_of_an_independent_one(monkeypatch):
     learner = TD3BC(None, STATE_SIZES)
     weights = {name: value.detach().clone() for name, value in learner.net.named_parameters()}
     batches = [make_batch(16, seed) for seed in range(8)]
-    batches = [dataclasses.replace(b, observation=b.state, next_observation=b.state.flip(0)) for b in batches]
+    over = torch.arange(16) % 3 == 0  # episodes that ended there
+    changed = dict(discount=(~over).float())
+    batches = [
+        dataclasses.replace(b, observation=b.state, next_observation=b.state.flip(0), **changed) for b in batches
+    ]
     noises = [torch.randn(16, ACTIONS, generator=torch.Generator().manual_seed(i)) for i in range(8)]
     drawn = iter(noises)
     monkeypatch.setattr(torch, "randn_like", lambda like: next(drawn))
@@ -480,6 +492,8 @@ OVERFIT = {
     "lfd": (lambda: LatentForwardDynamics(small_encoder(), SIZES), 40, 0.3),
     "ae": (lambda: Autoencoder(small_encoder(), SIZES), 60, 0.7),
     "state": (lambda: StatePrediction(small_encoder(), SIZES), 60, 0.3),
+    "lapo": (lambda: LatentActionPolicy(small_encoder(), SIZES), 60, 0.9),
+    "laom": (lambda: LatentActionObservationModel(small_encoder(), SIZES), 60, 0.3),
     "observation readout": (lambda: ObservationProbe(small_encoder(), SIZES), 60, 0.7),
     "state readout": (lambda: StateProbe(small_encoder(), SIZES), 80, 0.05),
 }

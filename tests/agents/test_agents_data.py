@@ -88,28 +88,31 @@ def test_the_next_observation_is_k_steps_on_under_the_same_shift():
         )
 
 
+def test_the_later_observation_is_k_steps_on_and_the_next_one_a_step():
+    data = make_data()
+    batch = data.batch(64, np.random.default_rng(1), next_observation=True, k=3, sample_k=True, later=True, shift=False)
+    rows = batch.reward.long()
+    torch.testing.assert_close(batch.next_observation, data.observe(rows + 1))
+    torch.testing.assert_close(batch.later_observation, data.observe(rows + batch.k))
+    assert set(batch.k.tolist()) == {1, 2, 3}
+    plain = data.batch(64, np.random.default_rng(1), next_observation=True, k=3, sample_k=True, shift=False)
+    assert plain.later_observation is None and torch.equal(plain.next_observation, batch.later_observation)
+
+
 def _stack(row):
     first = {True: 0}.get(row <= 4, 13)
     return [max(row - 2, first), max(row - 1, first), row]
 
 
-def test_shifts_are_drawn_for_training_and_not_for_the_hold_out():
+def test_shifts_are_drawn_for_training_unless_left_out_and_not_for_the_hold_out():
     data = make_data()
-    one = data.batch(32, np.random.default_rng(0), hold_out=True)
-    rows = one.reward.long()
-    torch.testing.assert_close(one.observation, data.observe(rows))
-    two = data.batch(32, np.random.default_rng(0))
-    plain = data.observe(two.reward.long())
-    same = (two.observation == plain).flatten(1).all(dim=1)
-    assert same.sum() < 8
-
-
-def test_shifts_can_be_left_out_and_the_same_transitions_are_drawn():
-    data = make_data()
+    held = data.batch(32, np.random.default_rng(0), hold_out=True)
+    torch.testing.assert_close(held.observation, data.observe(held.reward.long()))
     shifted, plain = (data.batch(32, np.random.default_rng(0), next_observation=True, shift=s) for s in (True, False))
     torch.testing.assert_close(plain.observation, data.observe(plain.reward.long()))
     torch.testing.assert_close(plain.next_observation, data.observe(plain.reward.long() + 1))
     assert (shifted.reward == plain.reward).all()
+    assert (shifted.observation == plain.observation).flatten(1).all(dim=1).sum() < 8
 
 
 SHORT = Budget("short", batch_size=8, state_batch_size=8, evaluations=3)
@@ -122,14 +125,6 @@ def test_a_training_shifts_its_pictures_as_it_is_told(monkeypatch, shift):
     monkeypatch.setattr(data, "batch", lambda *a, **k: asked.append((k["shift"], k["hold_out"])) or batch(*a, **k))
     train(pixel_learner(data), data, SHORT, 3, shift=shift)
     assert {told for told, held in asked if not held} == {shift}
-
-
-def test_scattered_episodes_are_the_rows_of_all(small_release):
-    subset = Release.open(small_release)["walker-walk/random/none"]
-    for name in ("pixels", "state", "length"):
-        every = subset.read(name)
-        for chosen in ([2, 0], [0, 2], [1], [2, 1, 0], [0, 1, 2]):
-            np.testing.assert_array_equal(subset.read(name, chosen), every[chosen])
 
 
 def test_states_are_normalized_by_the_training_episodes_with_a_floor():

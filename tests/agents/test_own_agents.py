@@ -18,7 +18,6 @@ from dm_control import suite
 import dmcvb_gen
 from dmcvb_gen import own_code
 from dmcvb_gen.benchmarks.cell import CellRun, OwnAgent, kept_results
-from dmcvb_gen.benchmarks.evaluate import Evaluator
 from dmcvb_gen.benchmarks.plan import BUDGETS, plan_benchmark
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import Release
@@ -62,23 +61,6 @@ def test_the_split_changes_what_is_seen_and_nothing_else(where):
     assert (seen["val"]["pixels"] != seen["train"]["pixels"]).any()
     with pytest.raises(UnknownNameError, match="train"):
         dmcvb_gen.evaluate(policy, where, split="trian")
-
-
-def test_it_is_the_evaluation_of_validate(small_release):
-    """The same policy as a learned one of `validate` on a subset, and as one's own by the subset's name."""
-    subset = Release.open(small_release)["walker-walk/random/dynamic"]
-
-    def own(observation):
-        return np.tanh(observation["pixels"].reshape(2, -1)[:, :6] / np.float32(255) - 0.5)
-
-    evaluator = Evaluator(subset, episodes=2, max_steps=5)
-    ours = evaluator.score(own)
-    evaluator.close()
-
-    size = subset.record.size
-    renderer = subset.record.renderer["name"]
-    theirs = dmcvb_gen.evaluate(own, "walker-walk/dynamic", episodes=2, max_steps=5, size=size, renderer=renderer)
-    np.testing.assert_allclose(theirs.returns, ours.returns, rtol=1e-4)
 
 
 @pytest.mark.parametrize("actions, told", [
@@ -284,20 +266,6 @@ def test_numbers_that_count_nothing_are_refused(option):
             dmcvb_gen.evaluate(lambda observation: None, where, pixels=False, **option)
     with pytest.raises(DmcvbError, match="seed is -1; give a whole number, at least 0"):
         dmcvb_gen.evaluate(lambda observation: None, "walker-walk/none", seed=-1)
-
-
-def test_a_benchmark_of_encoders_refuses_own_agents_alone_by_their_names(small_mazes, tmp_path, monkeypatch):
-    (tmp_path / "goal_agents.py").write_text(AGENTS)
-    monkeypatch.chdir(tmp_path)
-    command = ["validate", str(small_mazes), "--benchmark", "b3", "--out", str(tmp_path / "out")]
-    one, two = ["--agent", "goal_agents:still"], ["--agent", "goal_agents:learned"]
-    for agents, told in (
-        (one, "set beside bc, and goal_agents:still has none; remove it"),
-        (one + two, "goal_agents:still and goal_agents:learned have none; remove them"),
-    ):
-        result = CliRunner().invoke(main, command + agents)
-        said = " ".join(result.output.split())
-        assert result.exit_code == 2 and told in said and "state-bc" not in said
 
 
 @pytest.mark.parametrize("name, told", [("own_agnts:still", "cannot find agent"), ("bc", "--agents")])

@@ -19,13 +19,13 @@ from safetensors.torch import save_file
 
 from dmcvb_gen import own_code
 from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
-from dmcvb_gen.agents.data import Normalization, Slice, load_data, normalize_pixels
+from dmcvb_gen.agents.data import Normalization, Slice, choose_episodes, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.trainer import train
 from dmcvb_gen.benchmarks import cell as cells_module
-from dmcvb_gen.benchmarks.cell import CellRun, fingerprint, planned_steps, run_cells, state_units
+from dmcvb_gen.benchmarks.cell import CellRun, fingerprint, normalized_return, planned_steps, run_cells, state_units
 from dmcvb_gen.benchmarks.evaluate import Evaluator, TrainedAgent
 from dmcvb_gen.benchmarks.plan import (
     BENCHMARKS,
@@ -166,6 +166,45 @@ def test_the_one_command_that_b3_names_makes_one_release_that_has_its_data(tmp_p
     assert result.exit_code == 1 and {request.name for request in planned} == set(missing.subsets), result.output
     cells, none = plan_benchmark("b3", release_of(*missing.subsets, fixed_goals=5, episodes_per_goal=10))
     assert cells and not none
+
+
+@pytest.mark.parametrize("episodes, budgets", [(200, (2, 8, 32, 128)), (32, (2, 8)), (2, ())])
+@pytest.mark.parametrize("name", ["walker-walk/expert/dynamic", f"{MAZE}/expert/visible"])
+def test_b4_decodes_latent_actions_by_each_label_budget_beside_bc_on_it_and_on_all(name, episodes, budgets):
+    found, missing = planned("b4", name, episodes=episodes)
+    setting, agents = name.split("/")[-1], (("bc", ""), ("lapo+bc", "expert"), ("laom+bc", "expert"))
+    few = {(agent, f"{budget} expert", data, setting) for budget in budgets for agent, data in agents}
+    assert found == few | {("bc", "expert", "", setting)} and not missing
+
+
+def test_a_smaller_label_budget_is_a_part_of_a_larger_one_and_hangs_on_the_seed():
+    subset = release_of("walker-walk/expert/none", episodes=200)["walker-walk/expert/none"]
+    drawn = {}
+    for seed in (0, 1):
+        for budget in (2, 8, 32, 128):
+            episodes, held_out = choose_episodes(subset, Slice(subset.name, episodes=budget), seed)
+            drawn[seed, budget] = set(episodes.tolist())
+            assert len(drawn[seed, budget]) == budget and not held_out.any()
+        assert drawn[seed, 2] < drawn[seed, 8] < drawn[seed, 32] < drawn[seed, 128]
+    assert drawn[0, 8] != drawn[1, 8]
+
+
+def test_a_normalized_return_is_0_of_random_actions_and_100_of_the_experts():
+    names = [f"walker-walk/{level}/none" for level in ("random", "expert")]
+    release = release_of(*names)
+    for name, returns in zip(names, ([10.0, 30.0], [800.0, 840.0]), strict=True):
+        release[name].__dict__["returns"] = np.array(returns)
+    cell = Cell("b4", "walker-walk", "none", parse_agent("bc"), (Slice(names[1], episodes=2),))
+
+    def normalized(mean, limit=500, release=release, cell=cell):
+        return normalized_return(release, cell, {"mean": mean, "limit": limit})
+
+    assert [normalized(mean) for mean in (20.0, 420.0, 820.0)] == [0.0, 50.0, 100.0]
+    assert normalized(420.0, limit=10) is None  # of episodes that were cut elsewhere
+    alone = release_of(names[1])
+    alone[names[1]].__dict__["returns"] = np.array([820.0])
+    paper = 40.1  # the paper's table of the data's returns: random actions on walker-walk
+    assert normalized(paper, release=alone) == pytest.approx(0, abs=0.1)
 
 
 def test_mazes_have_the_papers_two_levels_in_b1_and_others_where_they_are_there():
@@ -586,6 +625,7 @@ def compared(task, pairs, benchmark="b1", setting="x"):
 @pytest.mark.parametrize("benchmark, task, setting, reference, agent, share, difference, words", [
     ("b1", MAZE, "x", ("state-bc", -40.0), ("bc", -800.0), None, -760.0, "BC(state)"),
     ("b1", "walker-walk", "x", ("state-bc", 800.0), ("bc", 400.0), 0.5, -400.0, "BC(state)"),
+    ("b4", "walker-walk", "x", ("bc", 800.0), ("lapo+bc", 200.0), 0.25, -600.0, "BC on all labels"),
     ("b3", MAZE, "x", ("bc", -60.0), ("id+bc", -45.0), None, 15.0, "BC on these episodes"),
     ("ablations", "walker-walk", "none", ("bc", 8.0), ("bc:frames=1", 4.0), 0.5, -4.0, "BC on all of expert/none"),
     ("ablations", MAZE, "visible", ("bc", -60.0), ("id+bc:k=5", -45.0), None, 15.0, "BC on all of expert/visible"),

@@ -132,6 +132,24 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     assert (out / "cells" / "b1_walker-walk_dynamic_bc_expert.decoder.png").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("task, setting", [("walker-walk", "dynamic"), ("ant-maze-empty7x7", "visible")])
+def test_label_budgets_are_validated_on_a_release_of_experts(task, setting, tmp_path):
+    pattern = {"tasks": task, "levels": "expert", "settings": setting, "episodes": 5, "max_steps": 30}
+    roll_out(small_recipe(subsets=[pattern]), tmp_path / "experts")
+    budget = replace(BUDGETS["smoke"], scores=True, readout_steps=0)
+    result = validate(tmp_path / "experts", tmp_path / "out", budget, benchmarks=["b4"])
+    facts = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert result.sound, result.failed
+    found = {(one["cell"]["agent"], one["labels"]["policy"]): one for one in facts["results"]}
+    assert set(found) == {("bc", "expert"), *((agent, "2 expert") for agent in ("bc", "lapo+bc", "laom+bc"))}
+    assert found["lapo+bc", "2 expert"]["episodes"] == 2
+    assert all(found[agent, "2 expert"]["pretraining"]["action_probe"] > 0 for agent in ("lapo+bc", "laom+bc"))
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "of BC on all labels" in page or " BC on all labels" in page
+    assert len(re.findall(r"probe misses \d+ % of the actions", page)) == 2
+
+
 def markdown_tables(text):
     """Tables of a Markdown page as a renderer of Markdown sees them: lists of rows of cells."""
     page = markdown.markdown(text, extensions=["tables"]).replace("<br>", "\n")
@@ -145,8 +163,8 @@ def test_its_tables_stand_in_markdown_too(report):
     checks, returns, scores, missing = markdown_tables(text)
     assert [row[0] for row in checks[1:]] == list(CHECKS) and {row[2] for row in checks[1:]} == {"0"}
     assert all(len(row) == len(table[0]) for table in (checks, returns, scores, missing) for row in table)
-    for name, values in facts["returns"].items():
-        assert [name, *(f"{values[statistic]:.1f}" for statistic in STATISTICS)] in returns
+    [(name, values)] = facts["returns"].items()
+    assert returns[1] == [name, *(f"{values[statistic]:.1f}" for statistic in STATISTICS)]
     shown = {agent: cell for agent, cell in zip(scores[0], scores[1], strict=True) if "[smoke]" in cell}
     for entry in facts["results"]:
         lines = shown.pop(entry["cell"]["agent"]).splitlines()
@@ -164,6 +182,17 @@ def test_a_message_stays_in_its_cell_of_a_markdown_table(report):
     assert not {"<script", "<a", "<em", "<code"} & set(re.findall("<\\w+", page))
     found = markdown_tables(text)[1][1]
     assert found[:4] == ["files", "x|y", "0", ""] and found[4].split() == message.split()
+
+
+def test_settings_that_share_trajectories_share_a_row_of_returns(report):
+    facts = json.loads((report[1] / "report.json").read_text())
+    [(name, values)] = facts["returns"].items()
+    place = name.rpartition("/")[0]
+    facts["returns"] |= {f"{place}/static": values, "cheetah-run/expert/none": values | {"mean": 1.0}}
+    rows = markdown_tables(render_tables(facts))[1][1:]
+    assert [row[0] for row in rows] == [
+        f"{place}/dynamic, static", f"the paper's {place}", "cheetah-run/expert/none", "the paper's cheetah-run/expert"
+    ]  # fmt: skip
 
 
 @pytest.mark.slow

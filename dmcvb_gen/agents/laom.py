@@ -1,0 +1,60 @@
+"""LAOM: latent actions where distractors move, too (Nikulin et al. 2025, "Latent action learning requires supervision
+in the presence of distractors", section 4; arXiv 2502.00379).
+
+LAPO with four changes: the inverse model sees an observation several steps later; its latent action is not replaced by
+codes; the forward model predicts what a slow average of the encoder sees, and no image; observations are augmented.
+"laom+bc" decodes the latent actions by all labeled trajectories that it is given. The paper's supervised variant, whose
+latent actions learn from labels, too, is not this one.
+
+What differs from the paper: the networks are those of DMC-VB's agents, so a latent action has 64 numbers (256 in
+`quick`) instead of 8,192; the augmentation is DMC-VB's random shift, as far as the budget shifts; all of it is trained
+in one training, in place of one after the other.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+
+from dmcvb_gen.agents.data import Sizes
+from dmcvb_gen.agents.learners import Batch, Learner, adam, frozen_copy, move_towards, register_agent
+from dmcvb_gen.agents.networks import MLP, PAPER, Architecture, Encoder, observation_encoder
+
+
+@register_agent("laom")
+class LatentActionObservationModel(Learner):
+    """|| e_EMA(o_t+1) - g(e(o_t), f(e(o_t), e(o_t+k))) ||^2 + || phi(o_t) - z ||^2, z = f(e(o_t), e(o_t+1)).
+
+    phi is kept. k is drawn from 1..10. No gradient of the second term reaches f and e.
+    """
+
+    needs_next = needs_later = sample_k = True
+    k_max, decay = 10, 0.999
+
+    def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
+        super().__init__()
+        self.encoder, width = encoder, encoder.features
+        self.see = observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
+        self.target = frozen_copy(self.see)
+        self.f = MLP(2 * width, width, tanh=True)
+        self.g = MLP(2 * width, width, tanh=True)
+        self.optimizers = {"main": adam([self])}
+
+    def latent_action(self, batch: Batch) -> torch.Tensor:
+        """z: (batch, latent) in (-1, 1), of one step."""
+        both = self.see(torch.cat([batch.observation, batch.next_observation]))
+        return self.f(torch.cat(both.chunk(2), dim=1)).float()
+
+    def losses(self, batch):
+        seen, later = self.see(torch.cat([batch.observation, batch.later_observation])).chunk(2)
+        predicted = self.g(torch.cat([seen, self.f(torch.cat([seen, later], dim=1))], dim=1))
+        with torch.no_grad():
+            wanted, z = self.target(batch.next_observation), self.latent_action(batch)
+        model = F.mse_loss(predicted.float(), wanted.float())
+        policy = F.mse_loss(self.encoder(batch.observation).float(), z)
+        return {"loss": model + policy, "model": model, "policy": policy}
+
+    def update(self, batch):
+        losses = super().update(batch)
+        move_towards(self.target, self.see, self.decay)
+        return losses
