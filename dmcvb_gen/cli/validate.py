@@ -77,13 +77,9 @@ def _validated(result, budget) -> Iterator[str]:
         yield f"{entry.benchmark}: not in the release: {', '.join(entry.subsets)}; to get them: {entry.command}"
     checked = ", ".join(pluralize(count, name) for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
-    verdict = ["sound" if result.sound else pluralize(found, "findings")]
+    yield f"{'All checks passed' if result.sound else pluralize(found, 'findings')} ({checked})."
     if not result.complete:
-        there, asked = result.episodes
-        verdict = [
-            f"incomplete: {there:,} of {asked:,} episodes",
-            "what is there is sound" if result.sound else verdict[0],
-        ]
-    note = f"; {budget.note}" if result.results else ""
-    yield f"{'; '.join(verdict)} ({checked}){note}"
+        yield "Incomplete: {:,} of {:,} episodes.".format(*result.episodes)
+    if result.results:
+        yield f"Profile {budget.note}"
     yield f"Report: {result.report}"
