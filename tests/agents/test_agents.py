@@ -548,8 +548,8 @@ def test_an_unknown_agent_is_refused_with_the_known_ones(name):
 
 @pytest.mark.parametrize("name, takes", [
     ("bc:frames=0", "frames=1..64"), ("bc:depth=3", "frames=1..64"), ("id+bc:k=x", "frames=1..64, k=1..64, sample"),
-    ("id+bc:sample=3", "k=1..64, sample"), ("lfd+bc:k=10,sample", "frames=1..64"), ("state-bc:frames=1", "none"),
-    ("td3-bc:k=5", "frames=1..64, unbounded"),
+    ("id+bc:sample=3", "frames=1..64, k=1..64, sample"), ("lfd+bc:k=10,sample", "frames=1..64"),
+    ("state-bc:frames=1", "none"), ("td3-bc:k=5", "frames=1..64, unbounded"),
 ])  # fmt: skip
 def test_an_option_that_an_agent_does_not_know_is_refused_with_those_that_it_takes(name, takes):
     with pytest.raises(DmcvbError, match=f"is not an option of agent .*; it takes {takes}$"):

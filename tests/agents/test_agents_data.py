@@ -280,6 +280,7 @@ def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, change
     whole = make_learner(data)
     wanted = train(whole, data, budget, 12)
     monkeypatch.setattr(trainer, "SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(trainer, "TICK_SECONDS", -1.0)
     made = []
 
     def stop(steps):
@@ -298,7 +299,8 @@ def test_a_stopped_run_goes_on_to_the_same_weights(tmp_path, monkeypatch, change
     assert [without_time(point) for point in curve] == [without_time(point) for point in wanted]
 
 
-def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to():
+def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to(monkeypatch):
+    monkeypatch.setattr(trainer, "TICK_SECONDS", -1.0)
     data, rates = make_data().states_only(), {True: [], False: []}
     for decay, seen in rates.items():
         learner = state_learner(data)
