@@ -139,7 +139,7 @@ def _within(position: np.ndarray, bounds: CameraRange) -> np.ndarray:
 def nominal_target(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """The point that a nominal camera looks at, as far along its line of sight as the agent is away.
 
-    The Distracting Control Suite looks there, which is a little beside the agent's centre of mass.
+    The Distracting Control Suite looks there, which is a little off the agent's centre of mass.
 
     Args:
       offset: (3,) from the centre of mass to the nominal camera, meters.

@@ -41,7 +41,7 @@ class Color(Distractor):
         else:
             self._colors = np.repeat(color[:, None], scene.frames, axis=1)
         unseen = np.setdiff1d(np.arange(len(own)), seen_materials(scene.task.model))
-        self._colors[:, :, unseen] = own[unseen]  # a label that nobody sees would only cost bytes
+        self._colors[:, :, unseen] = own[unseen]  # a label without effect would only cost bytes
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
         return {"material_rgb": self._colors[:, frames]}

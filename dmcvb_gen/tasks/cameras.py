@@ -86,7 +86,7 @@ class Kinematics:
     def __call__(self, physics: np.ndarray) -> dict[str, np.ndarray]:
         """(frame, physics) float64 -> each field with a leading frame axis, float64.
 
-        A frame's poses do not depend on the frames beside it.
+        A frame's poses do not depend on the other frames.
         """
         return self._batch(np.asarray(physics, np.float64), self._fields)
 

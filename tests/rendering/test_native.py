@@ -1,7 +1,7 @@
 """The painter of our own against OpenGL, and against its own golden pictures.
 
 Golden pictures fail where a change of ours or of a dependency changes pixels. Look at the new ones before they
-replace the old: `python -m tests.rendering.test_native` writes them all anew.
+replace the old: `python -m tests.rendering.test_native` writes all of them again.
 """
 
 from __future__ import annotations

@@ -284,7 +284,7 @@ def test_fixed_pairs():
     batch = task.batch(100)
     state = batch.reset_fixed([np.random.default_rng(i) for i in range(100)], [pairs[0]] * 100)
     slices = task.state_slices
-    # Cells are fixed; offsets and yaw are drawn anew, the joints rest.
+    # Cells are fixed; offsets and yaw are drawn again, the joints rest.
     start, goal = (state[:, slices[name]] for name in ("walker_position", "target_position"))
     for found, cell, noise in ((start, pairs[0][0], 0.25), (goal, pairs[0][1], 0.5)):
         off = found[:, :2] - layout.world(cell)

@@ -165,7 +165,7 @@ def face_planes(rec):
 
 @part
 def choose_lamp(k, constants, lamps, lamp, eye, axes, f, which):
-    """Fill the lamp's entries of k with one of the lamps; the headlight shines beside the first one alone."""
+    """Fill the lamp's entries of k with one of the lamps; the headlight shines with the first one alone."""
     for i in range(9):
         k[L.SPOT + i] = lamps[which, i]
         k[L.HEADLIGHT + i] = constants[L.HEADLIGHT + i] if which == 0 else 0.0

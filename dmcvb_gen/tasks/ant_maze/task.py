@@ -149,7 +149,7 @@ class AntMazeBatch(PhysicsBatch):
 
         Args:
           offsets: (len(ids),) meters, within +-`SPAWN_NOISE`. Below about -0.15 an ant is flung up to a meter high,
-            and beside a wall it may come down on its back, where it stays.
+            and next to a wall it may come down on its back, where it stays.
         """
         self._qpos[ids, 2] = offsets
         self._refresh(ids)
