@@ -22,12 +22,14 @@ STEPS_PER_PROCESS = 5_000
 """Frames that are worth the start of another process, some four seconds."""
 
 
-def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCallback = ignore) -> Iterator[WorkResult]:
+def run_works(
+    works: Sequence[Work], workers: Workers | None = 1, progress: ProgressCallback = ignore
+) -> Iterator[WorkResult]:
     """Run works and yield their results as they finish.
 
     Args:
-      workers: processes, each with physics on one core; 1 works in this process, with physics on all cores; or a Ray
-        cluster.
+      workers: processes, each with physics on one core; 1 works in this process, with physics on all cores; None: as
+        many as are of use; or a Ray cluster.
       progress: called with the number of frames rendered since the last call. The expected number is that of full
         episodes at first, and follows the finished ones (mazes end early).
 
@@ -35,6 +37,7 @@ def run_works(works: Sequence[Work], workers: Workers = 1, progress: ProgressCal
       StoreError: the shards need more memory than is free, or a worker was killed (often for memory); what was
         put is safe.
     """
+    workers = workers or default_workers(works)
     check_memory(works, workers)
     kept = "finished shards are saved: rerun the same command (fewer --episodes-per-shard need less memory)"
     alone = workers == 1 or len(works) <= 1 and isinstance(workers, int)

@@ -18,7 +18,7 @@ from dmcvb_gen.dataset.manifest import Layer, ListedLayer, Resolved, SubsetRecor
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.dataset.writer import begin, finish, read_provenance, write_provenance
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.generate.executors import default_workers, run_works
+from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.resolve import all_pictures, image_layers, rendering_facts
 from dmcvb_gen.generate.works import works_of
@@ -130,7 +130,7 @@ def paint_release(
         notify(text)
     if works:
         write_provenance(store, "paint")
-    done = list(run_works(works, workers or default_workers(works), progress))
+    done = list(run_works(works, workers, progress))
     outcomes = [outcome for result in done for outcome in result.outcomes]
     differing = sorted(f"{each.layer} shard {each.shard}" for each in outcomes if each.equal is False)
     known = sum(each.equal is not None for each in outcomes)

@@ -13,7 +13,7 @@ from dmcvb_gen.dataset.manifest import COPY
 from dmcvb_gen.dataset.writer import begin, check_agree, check_versions, finish, write_provenance
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.engine import WorkResult
-from dmcvb_gen.generate.executors import default_workers, run_works
+from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.recipe import Recipe
 from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
 from dmcvb_gen.generate.resolve import Resolution, resolve
@@ -192,7 +192,7 @@ def run_plan(
 
     Args:
       plan: started by `start`.
-      workers: processes, or a Ray cluster; see `default_workers`.
+      workers: see `run_works`.
       progress: called with the number of frames rendered since the last call.
       finishing: write the manifest; False for a part, because other machines make the rest.
       on_result: called with the result of each work.
@@ -201,7 +201,7 @@ def run_plan(
       StoreError: the disk is full, or another machine has put other bytes.
     """
     started, steps = time.monotonic(), 0
-    for result in run_works(plan.works, workers or default_workers(plan.works), progress):
+    for result in run_works(plan.works, workers, progress):
         steps += result.steps
         on_result(result)
     release = finish(plan.store) if finishing else plan.release

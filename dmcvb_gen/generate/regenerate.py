@@ -25,7 +25,7 @@ from dmcvb_gen.dataset.writer import (
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.engine import ShardOutcome
-from dmcvb_gen.generate.executors import default_workers, run_works
+from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
 from dmcvb_gen.generate.paint import environment_diff
 from dmcvb_gen.generate.resolve import video_files
@@ -127,7 +127,7 @@ class Regeneration:
 
     def run(self, works: Sequence[Work], progress: ProgressCallback) -> tuple[ShardOutcome, ...]:
         """Run works, and tell their outcomes."""
-        results = run_works(works, self.workers or default_workers(works), progress)
+        results = run_works(works, self.workers, progress)
         return tuple(outcome for result in results for outcome in result.outcomes)
 
     def _faults(self, release: Release) -> set[tuple[str, int]]:

@@ -17,7 +17,7 @@ from dmcvb_gen.dataset.manifest import Layer, Resolved, SubsetRecord
 from dmcvb_gen.dataset.writer import begin, finish, put, put_record, write_provenance
 from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_bytes
-from dmcvb_gen.generate.executors import default_workers, run_works
+from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
 from dmcvb_gen.generate.paint import bare, recipe_after
 from dmcvb_gen.generate.render import check_renderer
@@ -117,7 +117,7 @@ def repaint(request: Repainting, workers: Workers | None = None, progress: Progr
         return layer.kind != "trajectories" and here and shard not in target.here(layer.name)
 
     works = works_of(target, wanted=is_missing)
-    for _ in run_works(works, workers or default_workers(works), progress):
+    for _ in run_works(works, workers, progress):
         pass
     return finish(store)
 
