@@ -21,7 +21,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.resolve import all_pictures, image_layers, rendering_facts
-from dmcvb_gen.generate.works import works_of
+from dmcvb_gen.generate.works import can_be_rendered, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import HIDDEN
@@ -121,9 +121,7 @@ def paint_release(
         release = Release.open(store)
 
     def is_missing(layer: Layer, shard: int) -> bool:
-        trajectories = release.layers[f"{layer.group.partition('.zarr/')[0]}/trajectories"]
-        here = shard in release.here(trajectories.name)
-        return layer.name in chosen and here and shard not in release.here(layer.name)
+        return layer.name in chosen and can_be_rendered(release, layer, shard)
 
     works = works_of(release, [record.name for record in records], episodes, is_missing, backgrounds=backgrounds)
     for text in drift if works else ():

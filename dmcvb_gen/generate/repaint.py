@@ -7,6 +7,7 @@ give.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ from dmcvb_gen.generate.resolve import (
     rendering_facts,
     video_files,
 )
-from dmcvb_gen.generate.works import works_of
+from dmcvb_gen.generate.works import can_be_rendered, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import DistractorSetting, is_maze
@@ -112,11 +113,7 @@ def repaint(request: Repainting, workers: Workers | None = None, progress: Progr
             _copy(release.store, store, shard)
     target = Release.in_making(store)
 
-    def is_missing(layer: Layer, shard: int) -> bool:
-        here = shard in target.here(f"{layer.group.partition('.zarr/')[0]}/trajectories")
-        return layer.kind != "trajectories" and here and shard not in target.here(layer.name)
-
-    works = works_of(target, wanted=is_missing)
+    works = works_of(target, wanted=functools.partial(can_be_rendered, target))
     for _ in run_works(works, workers, progress):
         pass
     return finish(store)

@@ -125,6 +125,12 @@ def works_of(
     return tuple(found)
 
 
+def can_be_rendered(release: Release, layer: Layer, shard: int) -> bool:
+    """Return True if a shard above trajectories is not here, and its trajectories are."""
+    trajectories = f"{layer.group.partition('.zarr/')[0]}/trajectories"
+    return shard in release.here(trajectories) and shard not in release.here(layer.name)
+
+
 def _groups(
     release: Release, records: Sequence[SubsetRecord], episodes: tuple[int, int] | None
 ) -> dict[tuple[str, int], list[SubsetRecord]]:
