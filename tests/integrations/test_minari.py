@@ -75,7 +75,8 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
             picture = Image.fromarray(np.full((256, 256, 3), (grey, 0, 255 - grey), np.uint8))
             picture.save(tmp_path / "videos" / split / "one" / f"{frame}.png")
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "static", "episodes": 1, "max_steps": 3}
-    recipe = small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "videos"), split="val", size=32)
+    shown = {"backgrounds": str(tmp_path / "videos"), "split": "val", "size": 32}
+    recipe = small_recipe(subsets=[pattern], action_repeat=1, **shown)
     videos = roll_out(recipe, tmp_path / "r").manifest.subsets[0].backgrounds["source"]
     export(str(tmp_path / "r"), "minari", tmp_path / "out")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
@@ -86,6 +87,7 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
     with pytest.raises(DmcvbError, match="videos of their own .* give their folder with backgrounds=FOLDER"):
         dataset.recover_environment()
     env = dataset.recover_environment(backgrounds=str(tmp_path / "r" / videos))
+    assert env.unwrapped.task.action_repeat == 1
     assert env.unwrapped._stage.split == "val"
     color = env.reset(seed=0)[0]["pixels"][0].mean(axis=0)  # the topmost line: sky
     env.close()
