@@ -476,9 +476,7 @@ def tolerance(x, lower=0.0, upper=0.0, margin=0.0, sigmoid="gaussian", value_at_
     elif sigmoid == "linear":
         scaled = distance * (1 - value_at_margin)
         value = np.where(np.abs(scaled) < 1, 1 - scaled, 0.0)
-    elif sigmoid == "quadratic":
+    else:
         scaled = distance * math.sqrt(1 - value_at_margin)
         value = np.where(np.abs(scaled) < 1, 1 - scaled**2, 0.0)
-    else:
-        raise ValueError(f"unknown sigmoid {sigmoid!r}")
     return np.where(inside, 1.0, value)

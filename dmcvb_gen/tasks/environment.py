@@ -339,7 +339,7 @@ def _bounds(id: str, environment: Any) -> tuple[np.ndarray, np.ndarray]:
         for name, default in (("minimum", -np.inf), ("maximum", np.inf))
     )
     lowest, highest = low <= -mujoco.mjMAXVAL, high >= mujoco.mjMAXVAL  # none, that is
-    low = np.where(lowest, np.minimum(-1, np.where(highest, -1, high - 2)), low)
+    low = np.where(lowest, np.minimum(-1, high - 2), low)
     high = np.where(highest, np.maximum(1, low + 2), high)
     if not (low < high).all():
         raise DmcvbError(f"{id} takes actions from {low} to {high}; the first must be less than the second")

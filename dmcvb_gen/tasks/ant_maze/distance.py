@@ -14,8 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import skfmm
 
-from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.spec import REWARDS
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 PIXELS = 10
@@ -88,20 +86,17 @@ def geodesic_field(layout: Layout, goal: np.ndarray) -> DistanceField:
 
 
 def make_field(reward: str, layout: Layout, goal: np.ndarray) -> DistanceField:
-    """The field of a measure for a goal position (x, y), meters.
+    """The field of a measure, one of `spec.REWARDS`, for a goal position (x, y), meters.
 
     Raises:
-      UnknownNameError: no such measure.
       LayoutError: the goal is in a wall.
     """
     row, column = np.rint(layout.grid(np.asarray(goal)[:2])).astype(int).tolist()
     cell = row, column
     if reward == "saturated":
         return saturated_field(layout, cell)
-    if reward == "geodesic":
-        layout.check_cell(cell, "goal")
-        return geodesic_field(layout, goal)
-    raise UnknownNameError("reward", reward, REWARDS)
+    layout.check_cell(cell, "goal")
+    return geodesic_field(layout, goal)
 
 
 def look_up(reward: str, layout: Layout, fields: np.ndarray, positions: np.ndarray) -> np.ndarray:

@@ -39,12 +39,8 @@ def save_paths_picture(layout: Layout, panels: dict[str, list[tuple[np.ndarray, 
         axis.set_title(title)
         axis.set_xlabel("x (m)")
     axes[0].set_ylabel("y (m)")
-    _write(figure, out)
-
-
-def _write(figure, path: str | Path) -> None:
     try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(out, dpi=110)
     except (OSError, ValueError) as error:
-        raise DmcvbError(f"cannot write {path} ({error}); give another place, ending in .png") from None
+        raise DmcvbError(f"cannot write {out} ({error}); give another place, ending in .png") from None
