@@ -11,12 +11,8 @@ import numpy as np
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.distractors.backgrounds import Backgrounds
-from dmcvb_gen.spec import DIFFICULTY_SCALES as SCALES
-from dmcvb_gen.spec import DISTRACTOR_KINDS as KINDS
 from dmcvb_gen.spec import DistractorSetting
 from dmcvb_gen.tasks.base import Task
-
-__all__ = ["KINDS", "SCALES", "Distractor", "Scene", "bounded_walk", "floor_alpha_for"]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 from dmcvb_gen import own_code, seeding
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, OPTIONAL_LABELS
 from dmcvb_gen.distractors.background import Background
-from dmcvb_gen.distractors.base import KINDS, Distractor, DistractorSetting
+from dmcvb_gen.distractors.base import Distractor
 from dmcvb_gen.distractors.camera import Camera
 from dmcvb_gen.distractors.color import Color
 from dmcvb_gen.distractors.cue import Cue
@@ -20,7 +20,7 @@ from dmcvb_gen.distractors.light import Light
 from dmcvb_gen.distractors.shake import Shake
 from dmcvb_gen.distractors.style import Style
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.spec import DISTRACTOR_ENTRY_POINTS, kind_of, own_distractors
+from dmcvb_gen.spec import DISTRACTOR_ENTRY_POINTS, DISTRACTOR_KINDS, DistractorSetting, kind_of, own_distractors
 
 BUILT_IN: tuple[type[Distractor], ...] = (Camera, Color, Background, Style, Cue, Shake, Light)
 """Together they give every label."""
@@ -34,7 +34,7 @@ def register_distractor(distractor: type[Distractor]) -> type[Distractor]:
       ValueError: a kind is taken or no plain word, or a label or the stream is unknown.
     """
     for kind in distractor.kinds:
-        taken = kind in KINDS or distractor in _registered.get(kind, ())
+        taken = kind in DISTRACTOR_KINDS or distractor in _registered.get(kind, ())
         if taken or not kind.replace("-", "").isalnum():
             raise ValueError(f"distractor kind {kind!r}: give a new word of letters, digits and '-'")
     if unknown := set(distractor.names) - set(DISTRACTOR_STATE_NAMES):
@@ -76,7 +76,7 @@ def typed_setting(name: str) -> str:
 
 def distractors_of(setting: DistractorSetting) -> tuple[type[Distractor], ...]:
     """The distractors that vary under a setting, the package's own first."""
-    if setting.kind not in (*KINDS, *_registered):
+    if setting.kind not in (*DISTRACTOR_KINDS, *_registered):
         for point in metadata.entry_points(group=DISTRACTOR_ENTRY_POINTS, name=setting.kind):
             _register_once(point.load(), setting.kind)
         for name in own_code.allowed(own_code.DISTRACTORS):

@@ -23,7 +23,6 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest, Resolved
 from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.distractors import background, camera, color, cue, light, load_backgrounds, shake
-from dmcvb_gen.distractors.base import KINDS, DistractorSetting
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.info import describe_release
@@ -46,7 +45,7 @@ from dmcvb_gen.release.episode_table import TABLE, header_facts, table_rows, wri
 from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
 from dmcvb_gen.release.statistics import level_statistics, states_json
 from dmcvb_gen.release.templates import fill
-from dmcvb_gen.spec import CUE, FIXED, LIGHT, SHAKE
+from dmcvb_gen.spec import CUE, DISTRACTOR_KINDS, FIXED, LIGHT, SHAKE, DistractorSetting
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.tasks import ACTION_REPEAT
@@ -321,7 +320,7 @@ def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, ...]]:
         if setting.kind == "none":
             rows.append((name, "the model's own camera, colors and sky", "", "", ""))
             continue
-        if setting.kind not in KINDS:
+        if setting.kind not in DISTRACTOR_KINDS:
             words = "; ".join((d.__doc__ or d.__name__).splitlines()[0] for d in distractors_of(setting) if d.kinds)
             rows.append((name, f"s = {setting.scale:g}; {words}", "", "", ""))
             continue
