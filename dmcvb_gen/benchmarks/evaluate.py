@@ -301,7 +301,7 @@ class Evaluator:
     def _see(self, stack, physics, walk: DistractorSampler, step: int, active, action=None) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
         rows = np.flatnonzero(active)
-        labels = walk.frame(step, physics, action)[rows]
+        labels = walk.labels(physics, action, step)[rows]
         shown = self.scene.pictures
         painted = self.renderer.render(physics[rows], labels, list(shown.views), hide_goal=shown.hide_goal)
         frames = painted.transpose(0, 1, 4, 2, 3).reshape(len(rows), -1, *painted.shape[2:4])

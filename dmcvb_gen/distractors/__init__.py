@@ -19,8 +19,8 @@ from dmcvb_gen.tasks.base import Task
 class DistractorSampler:
     """An episode batch's distractors, drawn ahead of the trajectory.
 
-    The random walks need only the streams. The states of the agent come frame by frame (`frame`) when an agent is
-    evaluated, or for whole episodes at once (`whole`).
+    The random walks need only the streams. The states of the agent come frame by frame when an agent is evaluated, or
+    for whole episodes at once.
 
     Args:
       generators: stream name -> one generator an episode; "camera", "color", "background", "style", "cue" are used.
@@ -42,25 +42,16 @@ class DistractorSampler:
         given = {name for distractor in self._drawn for name in distractor.names}
         self._left_out = [distractor for distractor in BUILT_IN if not given.issuperset(distractor.names)]
 
-    def frame(self, frame: int, physics: np.ndarray, actions: np.ndarray | None = None) -> DistractorState:
-        """Labels of one frame of all episodes, leading shape (episode,).
+    def labels(
+        self, physics: np.ndarray, actions: np.ndarray | None = None, frame: int | None = None
+    ) -> DistractorState:
+        """Labels of whole episodes, leading shape (episode, frame), or of one frame of all of them, (episode,).
 
         Args:
-          physics: (episode, physics) float64, the states at that frame.
-          actions: (episode, action), those before it; zeros before the first frame, or if None.
+          physics: (episode, frame, physics) float64, or (episode, physics) at that frame.
+          actions: (..., action), those before each frame; zeros before the first one, or if None.
         """
-        return self._labels(physics, actions, frame)
-
-    def whole(self, physics: np.ndarray, actions: np.ndarray | None = None) -> DistractorState:
-        """Labels of whole episodes, leading shape (episode, frame).
-
-        Args:
-          physics: (episode, frame, physics) float64.
-          actions: (episode, frame, action), the one before each frame; zeros if None.
-        """
-        return self._labels(physics, actions, slice(physics.shape[1]))
-
-    def _labels(self, physics: np.ndarray, actions: np.ndarray | None, frames: int | slice) -> DistractorState:
+        frames = slice(physics.shape[1]) if frame is None else frame
         found: dict[str, np.ndarray] = {}
         for nominal in self._left_out:
             found.update(nominal.nominal(self._scene, physics))
@@ -97,7 +88,7 @@ def sample_distractors(
       Labels with leading shape (episode, frame); an episode's labels depend on its own streams and states only,
       and a longer episode begins with the labels of a shorter one.
     """
-    return DistractorSampler(task, setting, physics.shape[1], generators, backgrounds, split).whole(physics, actions)
+    return DistractorSampler(task, setting, physics.shape[1], generators, backgrounds, split).labels(physics, actions)
 
 
 __all__ = [

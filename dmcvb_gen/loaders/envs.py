@@ -238,7 +238,7 @@ class _Stage:
 
     def labels(self, physics: np.ndarray) -> DistractorState:
         """Labels of the frame that each place shows now, leading shape (place,)."""
-        found = {int(frame): self.walk.frame(int(frame), physics, self.action) for frame in np.unique(self.frame)}
+        found = {int(frame): self.walk.labels(physics, self.action, int(frame)) for frame in np.unique(self.frame)}
         parts = [found[int(frame)][place : place + 1] for place, frame in enumerate(self.frame)]
         return DistractorState(
             **{name: np.concatenate([getattr(p, name) for p in parts]) for name, _ in parts[0].items()}
