@@ -241,8 +241,7 @@ class Release:
         try:
             return recorded_shards(self.store, layer)
         except StoreError:  # a web server gives no lists
-            runs = self.copy.promised.get(layer, ()) if self.copy else ()
-            return frozenset(number for first, last in runs for number in range(first, last))
+            return self.copy.shards(layer) if self.copy else ()
 
     def shards(
         self, names: Collection[str] = (), episodes: tuple[int, int] | None = None, images: bool = True

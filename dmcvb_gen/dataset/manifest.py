@@ -378,8 +378,9 @@ class Manifest(_Described):
     @pydantic.model_validator(mode="after")
     def _whole(self) -> Manifest:
         _check_tree(self.subsets, self.layers)
+        named = {layer.name: layer for layer in self.layers}
         for subset in self.subsets:
-            for layer in map(self.layer, subset.layers):
+            for layer in (named[name] for name in subset.layers):
                 if layer.kind != "images" and layer.shards * layer.episodes_per_shard < subset.episodes:
                     raise ValueError(f"{layer.name} has fewer episodes than {subset.name}")
         if sum(layer.shards for layer in self.layers) > 10 * MAX_SHARDS:
@@ -390,14 +391,6 @@ class Manifest(_Described):
     def imported(self) -> bool:
         """True if any of its subsets was imported, see `SubsetRecord.imported`."""
         return any(record.imported for record in self.subsets)
-
-    def layer(self, name: str) -> ListedLayer:
-        """One of its layers."""
-        return self._by_name[name]
-
-    @functools.cached_property
-    def _by_name(self) -> dict[str, ListedLayer]:
-        return {layer.name: layer for layer in self.layers}
 
 
 class Copy(_Model):
@@ -413,6 +406,10 @@ class Copy(_Model):
     manifest: Digest
     source: Line = ""
     promised: dict[RelativePath, tuple[tuple[int, int], ...]] = {}
+
+    def shards(self, layer: str) -> frozenset[int]:
+        """Numbers of the shards of a layer that were to be copied."""
+        return frozenset(number for run in self.promised.get(layer, ()) for number in range(*run))
 
 
 # -- JSON -----------------------------------------------------------------------------------------
@@ -498,9 +495,6 @@ def check_record(record: ShardRecord, layer: Layer, shard: int, where: str) -> S
 
 
 # -- the manifest of recipes and records ----------------------------------------------------------
-
-Counts = Mapping[str, int]
-"""Layer -> how many shards are there without a gap from the first."""
 
 
 def merged_layers(recipes: Iterable[Resolved]) -> dict[str, Layer]:

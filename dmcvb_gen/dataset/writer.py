@@ -344,7 +344,7 @@ def finish_copy(store: Store, manifest_text: bytes, source: str, promised: Mappi
     before: dict[str, Collection[int]] = {}
     if store.size(COPY) is not None:
         old = parse(Copy, store.read(COPY, MANIFEST_BYTES), f"{store.place}/{COPY}")
-        before = {name: [n for first, last in runs for n in range(first, last)] for name, runs in old.promised.items()}
+        before = {name: old.shards(name) for name in old.promised}
     names = sorted({*before, *promised})
     runs = {name: _runs({*before.get(name, ()), *promised.get(name, ())}) for name in names}
     store.replace(COPY, canonical_json(Copy(manifest=digest, source=source, promised=runs)))

@@ -386,38 +386,21 @@ class DistractedVectorEnv(VectorEnv):
     ) -> tuple[dict[str, np.ndarray], dict]:
         """Start all episodes; an int seeds place i with seed + i, as Gymnasium's own vector environments do.
 
-        Args:
-          options: {"reset_mask": (place,) bool} starts the episodes of these places alone.
-
         Raises:
-          DmcvbError: the mask has another shape or kind, or nothing was reset before.
+          DmcvbError: there is a reset_mask, or not one seed for each place.
         """
-        chosen = self._chosen(options)
+        if options and "reset_mask" in options:
+            raise DmcvbError("places restart by themselves, a step after their end; leave reset_mask out")
         if seed is not None or self._seeds is None:
             given = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
             given = [None] * self.num_envs if given is None else list(given)
             if len(given) != self.num_envs:
                 raise DmcvbError(f"{len(given)} seeds are given for {self.num_envs} environments; give one for each")
-            draws = [gymnasium.utils.seeding.np_random(value)[0] for value in given]
-            drawn = [int(rng.integers(2**63)) for rng in draws]
-            pairs = enumerate(zip(drawn, self._seeds or drawn, strict=True))
-            self._seeds = [new if place in chosen else old for place, (new, old) in pairs]
-            self._stage.started[chosen] = 0
-        self._stage.start(chosen, [self._seeds[place] for place in chosen])
-        self._ended[chosen] = False
+            self._seeds = [int(gymnasium.utils.seeding.np_random(value)[0].integers(2**63)) for value in given]
+            self._stage.started[:] = 0
+        self._stage.start(range(self.num_envs), self._seeds)
+        self._ended[:] = False
         return self._stage.observe(), self._info()
-
-    def _chosen(self, options: dict[str, Any] | None) -> list[int]:
-        """The places that a reset is about."""
-        if options is None or "reset_mask" not in options:
-            return list(range(self.num_envs))
-        mask = np.asarray(options["reset_mask"])
-        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            given = f"{mask.dtype} of shape {mask.shape}, {int(mask.astype(bool).sum())} of it true"
-            raise DmcvbError(f"reset_mask is {given}; give ({self.num_envs},) bool that is true for one place or more")
-        if self._seeds is None and not mask.all():
-            raise DmcvbError("reset_mask before the first reset; call reset() for all places first")
-        return np.flatnonzero(mask).tolist()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict]:
         if self._seeds is None:

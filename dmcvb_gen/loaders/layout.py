@@ -40,16 +40,14 @@ class _Stack:
         _, stack, channels, height, width = self._frames.shape
         return stack * channels, height, width
 
-    def push(self, pixels: np.ndarray, first: np.ndarray, only_first: bool = False) -> np.ndarray:
+    def push(self, pixels: np.ndarray, first: np.ndarray) -> np.ndarray:
         """Take up (place, size, size, channel); gives (place, stack * channel, size, size).
 
         Args:
           first: (place,) bool, where these are the first frames of episodes.
-          only_first: the frames of the other places are not new.
         """
         moved = np.moveaxis(pixels, -1, 1)
-        if not only_first:
-            self._frames = np.concatenate([self._frames[:, 1:], moved[:, None]], axis=1)
+        self._frames = np.concatenate([self._frames[:, 1:], moved[:, None]], axis=1)
         self._frames[first] = moved[first, None]
         return self._frames.reshape(len(pixels), *self.shape).copy()
 
@@ -96,9 +94,8 @@ class VectorDataLayout(VectorWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         observation, info = self.env.reset(seed=seed, options=options)
-        first = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
-        self._ended[first] = False
-        return {**observation, "pixels": self._stack.push(observation["pixels"], first, only_first=True)}, info
+        self._ended[:] = False
+        return self._stacked(observation, ~self._ended), info
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
         observation, reward, terminated, truncated, info = self.env.step(actions)

@@ -59,11 +59,6 @@ def environments() -> dict[str, tuple[str, str]]:
     return {environment_id(task, setting): (task, setting) for task, setting in pairs}
 
 
-def environment_ids() -> tuple[str, ...]:
-    """The registered names."""
-    return tuple(environments())
-
-
 def register() -> None:
     """Register the environments, so that `gymnasium.make` and `make_vec` know them; done once."""
     import gymnasium
