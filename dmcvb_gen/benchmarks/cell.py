@@ -46,12 +46,12 @@ from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
+from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
 from dmcvb_gen.loaders.sampler import StepSource
 from dmcvb_gen.own_code import AGENTS, find_function, source_digest
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, cores, ignore, open_pool
 from dmcvb_gen.policies.evaluation import goal_speed
-from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
 
@@ -457,11 +457,14 @@ class CellRun:
         evaluations = [point for point in curve if "score" in point]
         best = max(evaluations, key=lambda point: point["score"]["mean"])
         evaluating = sum(point["score"]["seconds"] for point in evaluations)
+        alike = (
+            best["score"]["limit"] == subset.record.max_steps
+        )  # returns of other lengths are not set beside the data's
+        normal = normalized(best["score"]["mean"], reference_returns(self.release, subset.record)) if alike else None
         paper = BENCHMARKS.get(cell.benchmark).paper_score(cell)
         return {
             "labels": {"policy": cell.policy_label, "encoder": cell.pretrain_label},
-            "score": best["score"] | {"step": best["step"]},
-            "normalized": normalized_return(self.release, cell, best["score"]),
+            "score": best["score"] | {"step": best["step"], "normalized": normal},
             "final": evaluations[-1]["score"],
             "evaluations": len(evaluations),
             "paper": paper and {"mean": paper[0], "stderr": paper[1]},
@@ -555,24 +558,6 @@ def data_score(subset: Subset, data: TrainingData) -> Score:
         reached = (data.discount[torch.as_tensor(ends - 1, device=data.device)] == 0).cpu().numpy()
         success, speed = float(reached.mean()), goal_speed(distance, data.lengths, reached, task)
     return Score.of(data.returns, success=success, speed=speed, limit=subset.record.max_steps)
-
-
-def normalized_return(release: Release, cell: Cell, score: dict[str, Any]) -> float | None:
-    """The score on a scale on which random actions have 0 and the expert data 100; None if there is no such scale.
-
-    The ends are the mean returns of the release's random and expert data, or else of the paper's. Episodes that were
-    cut elsewhere than the data's have other returns, as those of mazes.
-    """
-    ends, limit = [], release[cell.policy[0].subset].record.max_steps
-    for level in ("random", "expert"):
-        subsets = [s for s in release.subsets.values() if (s.task, s.level) == (cell.task, level)]
-        paper = paper_returns(cell.task, level)
-        if not subsets and not paper:
-            return None
-        ends.append(float(subsets[0].returns.mean()) if subsets else paper["mean"])
-    if score["limit"] != limit or not ends[0] < ends[1]:
-        return None
-    return 100 * (score["mean"] - ends[0]) / (ends[1] - ends[0])
 
 
 def state_units(release: Release, task: str) -> torch.Tensor:

@@ -565,8 +565,8 @@ def _score_lines(result: Mapping[str, Any], budget: Mapping[str, Any]) -> list[s
     elif result["difference"] and budget["scores"]:  # 0 is the reference itself
         side = "above" if result["difference"] > 0 else "below"
         lines.append(f"{_number(abs(result['difference']))} {side} {result['reference']}")
-    if result["normalized"] is not None and budget["scores"]:
-        lines.append(f"normalized {result['normalized']:.0f}")
+    if score["normalized"] is not None and budget["scores"]:
+        lines.append(f"normalized {score['normalized']:.0f}")
     lines += _goal_lines(score)
     if result["labels"]["encoder"]:
         lines.append(f"encoder: {result['labels']['encoder']}")

@@ -135,9 +135,9 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
 @pytest.mark.slow
 @pytest.mark.parametrize("task, setting", [("walker-walk", "dynamic"), ("ant-maze-empty7x7", "visible")])
 def test_label_budgets_are_validated_on_a_release_of_experts(task, setting, tmp_path):
-    pattern = {"tasks": task, "levels": "expert", "settings": setting, "episodes": 5, "max_steps": 30}
+    pattern = {"tasks": task, "levels": ["expert", "random"], "settings": setting, "episodes": 5, "max_steps": 30}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "experts")
-    budget = replace(BUDGETS["smoke"], scores=True, readout_steps=0)
+    budget = replace(BUDGETS["smoke"], scores=True, readout_steps=0, episode_steps=30)
     result = validate(tmp_path / "experts", tmp_path / "out", budget, benchmarks=["b4"])
     facts = json.loads((tmp_path / "out" / "report.json").read_text())
     assert result.sound, result.failed
@@ -145,8 +145,12 @@ def test_label_budgets_are_validated_on_a_release_of_experts(task, setting, tmp_
     assert set(found) == {("bc", "expert"), *((agent, "2 expert") for agent in ("bc", "lapo+bc", "laom+bc"))}
     assert found["lapo+bc", "2 expert"]["episodes"] == 2
     assert all(found[agent, "2 expert"]["pretraining"]["action_probe"] > 0 for agent in ("lapo+bc", "laom+bc"))
+    subsets = Release.open(tmp_path / "experts").subsets
+    low, high = (subsets[f"{task}/{level}/{setting}"].returns.mean() for level in ("random", "expert"))
+    for one in found.values():
+        assert one["score"]["normalized"] == pytest.approx(100 * (one["score"]["mean"] - low) / (high - low))
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "of BC on all labels" in page or " BC on all labels" in page
+    assert " BC on all labels" in page and page.count("<br>normalized ") == 4
     assert len(re.findall(r"probe misses \d+ % of the actions", page)) == 2
 
 
