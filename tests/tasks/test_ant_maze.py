@@ -1,6 +1,6 @@
 """Ant mazes against dm_control's composer environment, brute-force distances and hand-made layouts."""
 
-import heapq
+import itertools
 
 import labmaze
 import mujoco
@@ -14,7 +14,7 @@ from dm_control.locomotion.walkers import ant
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from labmaze import assets
-from scipy import ndimage
+from scipy import ndimage, sparse
 
 from dmcvb_gen.errors import LayoutError, UnknownNameError
 from dmcvb_gen.tasks import get_task
@@ -314,37 +314,27 @@ def mazes_of_text(draw):
     return text if (grid == ".").sum() > 1 else "\n".join(["****", "*..*", "****"])
 
 
-def dijkstra(layout, goal, fine=10):
-    """Shortest paths by Dijkstra on a grid with 32 directions, meters; never through a wall."""
-    floor = np.kron(~layout.walls, np.ones((fine, fine), bool))
-    unit = CELL / fine
-    moves = [(a, b) for a in range(-4, 5) for b in range(-4, 5) if np.gcd(a, b) == 1]
-    row, column = ((layout.grid(goal) + 0.5) * fine).astype(int)
-    offset = (np.array([row, column]) + 0.5) / fine - 0.5
-    first = float(np.linalg.norm(layout.world(offset) - goal))
-    distance = np.full(floor.shape, np.inf)
-    distance[row, column] = first
-    queue = [(first, int(row), int(column))]
+def shortest_paths(layout, goal, fine=10):
+    """Shortest paths on a grid with 32 directions, meters; never through a wall."""
+    floor = np.kron(~layout.walls, np.ones((fine, fine), bool))  # with walls around it
+    pixels, (r, c) = np.arange(floor.size).reshape(floor.shape), np.nonzero(floor)
     between = np.delete(np.arange(0.5, 37) / 37, 18)  # never on a pixel's border; half-way is looked at apart
-    while queue:
-        here, r, c = heapq.heappop(queue)
-        if here > distance[r, c]:
+    edges = []
+    for a, b in itertools.product(range(-4, 5), repeat=2):
+        if np.gcd(a, b) != 1:
             continue
-        for a, b in moves:
-            r2, c2 = r + a, c + b
-            if not (0 <= r2 < floor.shape[0] and 0 <= c2 < floor.shape[1]) or not floor[r2, c2]:
-                continue
-            if not floor[np.rint(r + a * between).astype(int), np.rint(c + b * between).astype(int)].all():
-                continue
-            if a % 2 and b % 2:  # half-way lies where four pixels meet: no way between walls that touch there
-                (r0, r1), (c0, c1) = ((x + d // 2, x + d // 2 + 1) for x, d in ((r, a), (c, b)))
-                if not (floor[r0, c0] or floor[r1, c1]) or not (floor[r0, c1] or floor[r1, c0]):
-                    continue
-            there = here + unit * np.hypot(a, b)
-            if there < distance[r2, c2] - 1e-12:
-                distance[r2, c2] = there
-                heapq.heappush(queue, (there, r2, c2))
-    return np.where(floor, distance, np.nan)
+        way = floor[np.rint(r[:, None] + a * between).astype(int), np.rint(c[:, None] + b * between).astype(int)]
+        free = floor[r + a, c + b] & way.all(axis=1)
+        if a % 2 and b % 2:  # half-way lies where four pixels meet: no way between walls that touch there
+            r0, c0 = r + a // 2, c + b // 2
+            free &= (floor[r0, c0] | floor[r0 + 1, c0 + 1]) & (floor[r0, c0 + 1] | floor[r0 + 1, c0])
+        edges.append([pixels[r, c][free], pixels[r + a, c + b][free], np.full(free.sum(), np.hypot(a, b))])
+    start, end, length = np.concatenate(edges, axis=1)
+    graph = sparse.coo_array((length, (start.astype(int), end.astype(int))), shape=(floor.size, floor.size)).tocsr()
+    place = ((layout.grid(goal) + 0.5) * fine).astype(int)
+    first = np.linalg.norm(layout.world((place + 0.5) / fine - 0.5) - goal)
+    away = sparse.csgraph.dijkstra(graph, indices=pixels[tuple(place)]).reshape(floor.shape)
+    return np.where(floor, first + CELL / fine * away, np.nan)
 
 
 @settings(max_examples=8, deadline=None)
@@ -355,7 +345,7 @@ def test_geodesic_field_is_the_shortest_path(text, seed):
     rng = np.random.default_rng(seed)
     goal = layout.world(layout.free[rng.integers(len(layout.free))]) + rng.uniform(-0.5, 0.5, 2)
     field = geodesic_field(layout, goal)
-    brute = dijkstra(layout, goal)
+    brute = shortest_paths(layout, goal)
     floor = np.isfinite(brute)
     # Fast marching is exact to a pixel or so; the grid's 32 directions are within 1 %.
     assert np.abs(field.values[floor] - brute[floor]).max() <= 1.5 * CELL / PIXELS + 0.05 * brute[floor].max()
