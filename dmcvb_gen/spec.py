@@ -219,8 +219,8 @@ class DistractorSetting:
         Raises:
           UnknownNameError: there is no such kind or difficulty. DmcvbError: a number is out of range.
         """
-        kind, _, difficulty = name.partition("_")
-        return cls(kind, difficulty or "medium")
+        kind, said, difficulty = name.partition("_")
+        return cls(kind, difficulty if said else "medium")
 
 
 def _number(value: float) -> str:

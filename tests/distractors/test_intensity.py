@@ -61,7 +61,7 @@ def test_words_are_points_on_the_dial():
     [
         *("dynamic_0", "dynamic_1.01", "dynamic_nan", "dynamic_-0.1", "dynamic_camera2", "dynamic_camera0"),
         *("dynamic_background0", "dynamic_background1.5", "dynamic_0.0001", "static_cue0.5", "dynamic_cue0"),
-        *("dynamic_cue1.5", "dynamic_cue", "dynamic_cue0.5-cue1"),
+        *("dynamic_cue1.5", "dynamic_cue", "dynamic_cue0.5-cue1", "dynamic_"),
     ],
 )
 def test_numbers_out_of_range_and_cues_that_cannot_be_are_refused(name):
