@@ -46,8 +46,8 @@ KINDS = {
     "maze": ["ant-maze-empty7x7", "--goal", "hidden"],
 }
 STRIKES = ("die", "full", "quota", "cut", "interrupt", "SIGKILL", "SIGTERM")
-OPERATIONS = 160
-"""File operations among which a strike is placed; the longest command has about as many."""
+PLACES = dict.fromkeys(STRIKES, 160) | {"quota": 4000, "cut": 4000}
+"""Strike -> operations, or bytes of a file, among which it is placed at first; one that comes too late lowers them."""
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
@@ -91,6 +91,7 @@ class History:
         self.kind, self.scratch, self.bucket = kind, scratch / kind, bucket
         self.after: dict[str, tuple[Path, Path]] = {}
         self.seconds: dict[str, float] = {}
+        self.places: dict[tuple[str, str], int] = {}
         for step in STEPS:
             folder, objects = self.lay(step)
             ended = self.run(step, folder)
@@ -157,10 +158,12 @@ def strike_once(history: History, step: Step, rng: random.Random) -> tuple[str, 
     newer = oracle.sha256(reference / "manifest.json")
     folder, objects = history.lay(step)
     try:
-        at = rng.randrange(1, 4000) if fault in ("quota", "cut") else rng.randrange(OPERATIONS)
+        at = rng.randrange(history.places.setdefault((step.name, fault), PLACES[fault]))
         mode = {"die": "kill"}.get(fault, fault)
         ended = history.run(step, folder, (mode, at), rng.uniform(0, history.seconds[step.name]))
         struck = ended.code != 0
+        if not struck and not fault.startswith("SIG"):
+            history.places[step.name, fault] = max(1, at)
         where = f"{history.kind}, {step.name}, {fault} at {at}"
         if "Traceback" in ended.said:
             return fault, struck, f"{where}: a traceback: {ended.said[-300:]}"
