@@ -9,7 +9,9 @@ os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linu
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from click.testing import CliRunner  # noqa: E402
 
+from dmcvb_gen.cli import main  # noqa: E402
 from dmcvb_gen.dataset.gate import Release  # noqa: E402
 from dmcvb_gen.dataset.manifest import record_path  # noqa: E402
 from dmcvb_gen.dataset.schema import decode  # noqa: E402
@@ -92,6 +94,18 @@ def small_mazes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mazes") / "mazes"
     roll_out(small_recipe(name="mazes", subsets=subsets), folder)
     return folder
+
+
+def invoke(*words, code=None):
+    """Run a command of dmcvb-gen in this process, and give its result; `code` is what it must end with."""
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    assert code in (None, result.exit_code), result.output
+    return result
+
+
+def records(release):
+    """Layer -> the records of its shards."""
+    return {name: release.records(name) for name in release.layers}
 
 
 def stack_channels(frames):

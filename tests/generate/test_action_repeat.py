@@ -5,10 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from dm_control import suite
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import Recipe, load_recipe
 from dmcvb_gen.loaders import DistractedEnv
@@ -18,7 +16,7 @@ from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
-from tests.conftest import TINY_MAZE, maze_recipe, roll_out
+from tests.conftest import TINY_MAZE, invoke, maze_recipe, roll_out
 
 NAME = "walker-walk/expert/dynamic"
 STEPS = {1: 12, 2: 6, 4: 3}
@@ -27,8 +25,7 @@ STEPS = {1: 12, 2: 6, 4: 3}
 
 def rollout(out, repeat, *words, code=0):
     words = ["--action-repeat", repeat, "--max-steps", STEPS[repeat], "--episodes", 2, "--size", 16, *words]
-    result = CliRunner().invoke(main, ["rollout", *map(str, words), "--out", str(out), "--workers", "1"])
-    assert result.exit_code == code, result.output
+    result = invoke("rollout", *words, "--out", out, "--workers", 1, code=code)
     return Release.open(out) if not code else result.output
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.generate.engine import paint
@@ -17,7 +15,7 @@ from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
-from tests.conftest import TINY_MAZE, maze_recipe, roll_out
+from tests.conftest import TINY_MAZE, invoke, maze_recipe, roll_out
 
 
 @pytest.mark.slow
@@ -164,9 +162,6 @@ def test_styles_of_data_and_of_evaluation_are_apart():
 
 
 def test_bad_requests(tmp_path):
-    def run(*arguments):
-        return CliRunner().invoke(main, ["rollout", *arguments, "--out", str(tmp_path / "r")])
-
     hole = tmp_path / "hole.txt"
     hole.write_text("****\n*   \n****\n")
     for arguments, message in [
@@ -178,6 +173,5 @@ def test_bad_requests(tmp_path):
         (["ant-maze-empty7x7", "--goal", "fixed100000"], "fixed goals"),
         (["ant-maze-empty7x7", "--steps", "100"], "episodes"),
     ]:
-        result = run(*arguments)
-        assert result.exit_code == 2 and message in result.output, (arguments, result.output)
+        assert message in invoke("rollout", *arguments, "--out", tmp_path / "r", code=2).output
     assert not (tmp_path / "r").exists()

@@ -8,9 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate import resolve
 from dmcvb_gen.generate.executors import run_works
@@ -19,7 +17,7 @@ from dmcvb_gen.generate.progress import progress_of
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.parallel import Ray
 from dmcvb_gen.storage.store import open_store
-from tests.conftest import roll_out
+from tests.conftest import invoke, roll_out
 
 WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}
 MAZE = {"tasks": "ant-maze-empty7x7", "levels": "expert", "settings": "hidden", "episodes": 4}
@@ -46,8 +44,7 @@ def whole(tmp_path_factory):
 
 
 def run(*words, code=0):
-    result = CliRunner().invoke(main, list(map(str, words)))
-    assert result.exit_code == code, result.output
+    result = invoke(*words, code=code)
     return result.stdout if code == 0 else result.output
 
 

@@ -8,12 +8,10 @@ import imageio.v3 as iio
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
 import dmcvb_gen
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.modalities.depth import SCALE
@@ -22,7 +20,7 @@ from dmcvb_gen.generate.modalities.parts import AGENT, BACKGROUND, COLORS, FLOOR
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
-from tests.conftest import roll_out, small_recipe
+from tests.conftest import invoke, roll_out, small_recipe
 
 MODALITIES = ["depth", "segmentation", "flow", "parts"]
 
@@ -46,8 +44,7 @@ def test_modalities_go_from_a_release_to_an_export(family, tmp_path, maze_releas
         length = len(flow) - 1
         assert flow.shape == (length + 1, 16, 16, 2) and flow.dtype == np.float32
         assert not flow[-1].any() and np.abs(flow[:-1]).max() > 0 and np.isfinite(flow).all()
-    result = CliRunner().invoke(main, ["export", str(tmp_path / "r"), "--to", "npz", "--out", str(tmp_path / "npz")])
-    assert result.exit_code == 0, result.output
+    invoke("export", tmp_path / "r", "--to", "npz", "--out", tmp_path / "npz", code=0)
     file = np.load(sorted((tmp_path / "npz").rglob("*.npz"))[-1])
     key = "flow" if len(views) == 1 else f"flow_{views[0]}"
     np.testing.assert_array_equal(file[key], flow)
@@ -60,9 +57,8 @@ def test_modalities_go_from_a_release_to_an_export(family, tmp_path, maze_releas
 
 def check_lerobot(folder, file, flow, video):
     """LeRobot's frames of the last episode hold what npz's do: exactly, but for 8 bits and a codec."""
-    command = ["export", str(folder / "r"), "--to", "lerobot", "--out", str(folder / f"lerobot{video}")]
-    result = CliRunner().invoke(main, [*command, *["--video"] * video])
-    assert result.exit_code == 0, result.output
+    words = ["--to", "lerobot", "--out", folder / f"lerobot{video}", *["--video"] * video]
+    invoke("export", folder / "r", *words, code=0)
     [info] = [json.loads(path.read_text()) for path in (folder / f"lerobot{video}").rglob("info.json")]
     length = len(file["action"]) - 1
     for modality in MODALITIES:

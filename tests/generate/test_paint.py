@@ -7,26 +7,20 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.dataset.writer import finish_copy
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.paint import Wanted, paint_release
 from dmcvb_gen.release.verify import check_files
-from tests.conftest import maze_recipe, roll_out, small_recipe
+from tests.conftest import invoke, maze_recipe, records, roll_out, small_recipe
 
 SHORT = {"tasks": "walker-walk", "levels": "random", "episodes": 3, "episodes_per_shard": 2, "max_steps": 6}
 RECIPES = {
     "walker": small_recipe(subsets=[SHORT | {"settings": ["none", "dynamic"]}]),
     "maze": maze_recipe(settings=("visible", "hidden"), max_steps=30),
 }
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module", params=RECIPES)
@@ -41,11 +35,6 @@ def made(request, tmp_path_factory):
 @pytest.fixture
 def light(made, tmp_path):
     return shutil.copytree(made / "light", tmp_path / "light")
-
-
-def records(place):
-    release = Release.open(place)
-    return {name: release.records(name) for name in release.layers}
 
 
 def copy_without_images(source, target):
@@ -67,11 +56,11 @@ def copy_without_images(source, target):
 def test_painting_a_light_release_gives_the_records_of_a_painted_one(made, light):
     release = Release.open(light)
     assert not any(layer.kind == "images" for layer in release.layers.values()) and not release.shortfalls
-    told = json.loads(run("paint", light, "--workers", 2, "--json").stdout)
+    told = json.loads(invoke("paint", light, "--workers", 2, "--json").stdout)
     images = [layer for layer in Release.open(made / "painted").layers.values() if layer.kind == "images"]
     assert told["shards"] == 2 * len(images) and told["known"] == 0 and told["complete"]
-    assert records(light) == records(made / "painted")
-    assert "every shard that is here has its images already" in run("paint", light).output
+    assert records(Release.open(light)) == records(Release.open(made / "painted"))
+    assert "every shard that is here has its images already" in invoke("paint", light).output
 
 
 @pytest.mark.slow_cases("maze")
@@ -86,9 +75,9 @@ def test_a_part_can_be_painted_and_the_rest_says_how(made, light):
     with pytest.raises(StoreError, match="dmcvb-gen paint"):
         subset.read(array, [last])
     assert subset.unpainted.tolist() == [index not in here for index in range(len(subset))]
-    assert run("preview", light, "--episodes", 1).exit_code == 0  # of what has images
+    assert invoke("preview", light, "--episodes", 1).exit_code == 0  # of what has images
     paint_release(light)
-    assert records(light) == records(made / "painted")
+    assert records(Release.open(light)) == records(Release.open(made / "painted"))
 
 
 def test_images_that_are_known_are_compared_and_others_are_named(made, tmp_path):
@@ -102,7 +91,7 @@ def test_images_that_are_known_are_compared_and_others_are_named(made, tmp_path)
     [file] = Release.open(tmp_path / "other").records(layer.name)[1].files.values()
     text = listed.read_text().replace(file.sha256, "0" * 64)
     _swap_list(tmp_path / "other", layer, text)
-    result = run("paint", tmp_path / "other")
+    result = invoke("paint", tmp_path / "other")
     assert result.exit_code == 1 and f"differs: {layer.name} shard 1" in result.output
     assert not (tmp_path / "other" / record_path(layer.name, 1)).exists()
 
@@ -139,6 +128,6 @@ def test_a_copy_gains_images_of_another_size_and_keeps_its_digest(made, tmp_path
     (["--only", "cheetah-run"], "walker-walk/random/none"),
 ])  # fmt: skip
 def test_images_that_cannot_be_are_refused_in_a_line(small_release, words, cure):
-    result = run("paint", small_release, *words)
+    result = invoke("paint", small_release, *words)
     assert result.exit_code == 2 and cure in result.output and result.output.count("\n") == 1
-    assert "ant-maze" in run("paint", small_release, "--goal", "hidden").output
+    assert "ant-maze" in invoke("paint", small_release, "--goal", "hidden").output

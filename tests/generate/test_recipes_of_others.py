@@ -1,9 +1,7 @@
 """The shipped recipes: what was published of those after other benchmarks, and a tiny cut of each made and verified."""
 
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import expand, load_recipe, shipped_recipes
 from dmcvb_gen.policies import bundled
@@ -14,6 +12,7 @@ from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.spec import DistractorSetting
 from dmcvb_gen.tasks import get_task
+from tests.conftest import invoke
 
 TINY = ["--episodes", "2", "--max-steps", "3", "--size", "8"]
 SUITE = {"ball_in_cup-catch", "cartpole-swingup", "cheetah-run", "finger-spin", "reacher-easy", "walker-walk"}
@@ -31,7 +30,7 @@ PUBLISHED = {
 
 
 def run(*arguments):
-    return CliRunner().invoke(main, ["rollout", *map(str, arguments)])
+    return invoke("rollout", *arguments)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

@@ -7,15 +7,13 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.generate.regenerate import Regeneration
-from tests.conftest import rewrite, roll_out, small_recipe
+from tests.conftest import invoke, rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/random/dynamic"
 GROUP = "walker-walk/random.zarr"
@@ -103,7 +101,7 @@ def change_actions(folder):
 
 def test_a_difference_is_said_with_how_far_and_what_differs_in_the_environment(copy):
     change_actions(copy)
-    result = CliRunner().invoke(main, ["regenerate", str(copy), "--only", NAME, "--range", "0:1", "--check"])
+    result = invoke("regenerate", copy, "--only", NAME, "--range", "0:1", "--check")
     assert result.exit_code == 1
     assert "trajectories shard 0 (episodes 0:2): made again, other bytes; action: max" in result.output
     assert "pixels: max 3, mean" in result.output and "state: max" not in result.output
@@ -165,10 +163,10 @@ def test_videos_and_policies_that_are_lost_are_put_back(tmp_path):
     [policy] = (tmp_path / "r/policies").iterdir()
     policy.write_bytes(policy.read_bytes()[:20])
     command = ["regenerate", str(tmp_path / "r"), "--backgrounds", str(tmp_path / "videos")]
-    result = CliRunner().invoke(main, command)
+    result = invoke(*command)
     assert result.exit_code == 0 and "3 other files put back" in result.output, result.output
     assert files_of(tmp_path / "r") == before
-    assert "nothing is damaged" in CliRunner().invoke(main, command).output
+    assert "nothing is damaged" in invoke(*command).output
 
 
 @pytest.mark.parametrize("arguments, cure", [
@@ -179,5 +177,5 @@ def test_videos_and_policies_that_are_lost_are_put_back(tmp_path):
     (["r", "--check", "--out", "x"], "not both"),
 ])  # fmt: skip
 def test_a_manifest_and_a_release_are_not_mixed_up(arguments, cure):
-    result = CliRunner().invoke(main, ["regenerate", *arguments])
+    result = invoke("regenerate", *arguments)
     assert result.exit_code == 2 and cure in result.output

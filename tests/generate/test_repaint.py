@@ -6,9 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError
@@ -19,7 +17,7 @@ from dmcvb_gen.policies import simulate
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
-from tests.conftest import rewrite, roll_out, small_recipe
+from tests.conftest import invoke, records, rewrite, roll_out, small_recipe
 
 
 @pytest.fixture
@@ -43,9 +41,7 @@ NAME = "walker-walk/random/dynamic"
 
 def test_a_repainted_subset_has_the_records_of_a_rolled_out_one(small_release, dynamic, tmp_path):
     ours, theirs = Release.open(dynamic), Release.open(small_release)
-    assert {name: ours.records(name) for name in ours.layers} == {
-        name: theirs.records(name) for name in theirs[NAME].record.layers
-    }
+    assert records(ours) == {name: theirs.records(name) for name in theirs[NAME].record.layers}
     request, ticks = Repainting(small_release, tmp_path / "r", ["*/*/none"], distractor="dynamic"), []
     assert repaint(request, 2, ticks.append).digest == ours.digest and len(ticks) > 1
 
@@ -115,8 +111,7 @@ def test_modalities_have_the_views_of_the_task(tmp_path):
         ["paint", str(tmp_path / "few views"), "--views", "egocentric,top"],
         ["repaint", str(tmp_path / "few views"), "--label", "depth", "--out", str(tmp_path / "new labels")],
     ):
-        result = CliRunner().invoke(main, command)
-        assert result.exit_code == 0, result.output
+        result = invoke(*command, code=0)
     assert f"dmcvb-gen preview '{tmp_path / 'new labels'}'" in result.output
     [subset] = Release.open(tmp_path / "new labels").subsets.values()
     depth = {name for name in subset.arrays if name.startswith("depth")}
@@ -129,8 +124,7 @@ def test_the_other_renderer_paints_nearly_the_same_scene(tmp_path):
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1}
     roll_out(small_recipe(subsets=[pattern]), tmp_path / "native")
     options = ["--renderer", "opengl", "--name", "gl", "--out", str(tmp_path / "gl")]
-    result = CliRunner().invoke(main, ["repaint", str(tmp_path / "native"), *options])
-    assert result.exit_code == 0, result.output
+    invoke("repaint", tmp_path / "native", *options, code=0)
     old, new = (Release.open(tmp_path / f)["walker-walk/random/none"].read("pixels") for f in ("native", "gl"))
     assert 0 < np.abs(old.astype(int) - new).mean() < 15
     [subset] = Release.open(tmp_path / "gl").manifest.subsets
@@ -200,9 +194,7 @@ def test_a_maze_repainted_for_evaluation_is_what_its_rollout_would_be(tmp_path):
     roll_out(small_recipe(**recipe), tmp_path / "train")
     wanted = roll_out(small_recipe(**recipe, split="val"), tmp_path / "wanted")
     found = repaint(Repainting(tmp_path / "train", tmp_path / "val", split="val"), 1)
-    assert {name: found.records(name) for name in found.layers} == {
-        name: wanted.records(name) for name in wanted.layers
-    }
+    assert records(found) == records(wanted)
     assert {subset.split for subset in found.manifest.subsets} == {"val"}
     for folder, styles in (("train", {2, 3, 4, 5}), ("val", {1})):
         for subset in Release.open(tmp_path / folder).subsets.values():

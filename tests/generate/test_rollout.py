@@ -15,9 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
@@ -34,14 +32,10 @@ from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks import get_task
-from tests.conftest import TINY_MAZE, maze_recipe, roll_out, small_recipe
+from tests.conftest import TINY_MAZE, invoke, maze_recipe, records, roll_out, small_recipe
 from tests.faults.commands import GRACE, session
 
 NAME = "walker-walk/random/dynamic"
-
-
-def records(release):
-    return {name: release.records(name) for name in release.layers}
 
 
 def test_works_in_any_order_and_workers_give_one_digest(small_release, tmp_path):
@@ -350,8 +344,7 @@ RECIPE = ["rollout", "--recipe", "dmcvb-mini", "walker-walk", "--level", "random
 
 def test_options_beside_a_recipe_are_heard(tmp_path):
     changes = ["--episodes", "1", "--seed", "7", "--size", "8", "--max-steps", "3"]
-    result = CliRunner().invoke(main, [*RECIPE, *changes, "--out", str(tmp_path / "r"), "--json"])
-    assert result.exit_code == 0, result.output
+    invoke(*RECIPE, *changes, "--out", tmp_path / "r", "--json", code=0)
     release = Release.open(tmp_path / "r")
     [subset] = release.manifest.subsets
     assert (subset.name, subset.episodes, subset.size, subset.max_steps) == ("walker-walk/random/none", 1, 8, 3)
@@ -397,8 +390,7 @@ def test_a_dry_run_for_a_bucket_knows_policies_and_videos_that_are_not_there_yet
     videos = ["--distractor", "dynamic", "--backgrounds", str(tmp_path / "videos")] if task == "walker-walk" else []
     asked = ["rollout", task, "--level", "expert", "--behaviour", str(own), *videos, "--episodes", "1", "--size", "16"]
     sizes = ["--max-steps", "20", "--out", f"file://{tmp_path}/bucket"]
-    result = CliRunner().invoke(main, [*asked, *sizes, "--dry-run", "--json"])
-    assert result.exit_code == 0, result.output
+    result = invoke(*asked, *sizes, "--dry-run", "--json", code=0)
     assert json.loads(result.stdout)["frames"] > 0 and not (tmp_path / "bucket").exists()
 
 

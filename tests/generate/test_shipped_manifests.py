@@ -7,17 +7,16 @@ import lzma
 import random
 
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import load_recipe
 from dmcvb_gen.generate.resolve import resolve
 from dmcvb_gen.generate.shipped import ENDING, load_shipped, pack, shipped_manifests
+from tests.conftest import invoke
 
 
 def run(*arguments):
-    return CliRunner().invoke(main, ["regenerate", *map(str, arguments)])
+    return invoke("regenerate", *arguments)
 
 
 @pytest.mark.slow
