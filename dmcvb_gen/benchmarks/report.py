@@ -432,7 +432,7 @@ def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
         curves=[figure_url(figure) for figure in curve_figures(good, name)],
         rollouts=_sheets(good, folder, "rollout"),
         decoders=_sheets(good, folder, "decoder"),
-        inspection=_inspection(good, name),
+        inspection=_inspection(good),
         times=[
             (result["id"], *(f"{result['seconds'][part]:.0f}" for part in ("training", "evaluation", "inspection")))
             for result in facts["results"]
@@ -640,14 +640,15 @@ def _notes(facts: Mapping[str, Any]) -> list[str]:
     return notes
 
 
-def _inspection(good: Results, budget: str) -> list[tuple]:
+def _inspection(good: Results) -> list[tuple[str, ...]]:
+    """A row an encoder; none for those of data of which nothing is held out."""
     rows = []
     for cell, result in good:
-        if found := result["inspection"]:
-            errors = [found[key] for key in ("observation_mse", "state_mse")]
-            fields = ", ".join(f"{name} {error:.3f}" for name, error in (found["state_l1"] or {}).items())
-            shown = ["-" if error is None else f"{error:.4f}" for error in errors]
-            rows.append((cell.label, cell.place, *shown, fields, budget))
+        found = result["inspection"]
+        if found and found["state_l1"]:
+            fields = ", ".join(f"{name} {error:.3f}" for name, error in found["state_l1"].items())
+            errors = [f"{found[key]:.4f}" for key in ("observation_mse", "state_mse")]
+            rows.append((cell.label, cell.place, *errors, fields))
     return rows
 
 

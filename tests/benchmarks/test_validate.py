@@ -33,6 +33,7 @@ from dmcvb_gen.benchmarks.plan import BUDGETS, only, plan_benchmark
 from dmcvb_gen.benchmarks.report import (
     CHECKS,
     STATISTICS,
+    _inspection,
     curve_figures,
     render_page,
     render_tables,
@@ -197,6 +198,14 @@ def test_settings_that_share_trajectories_share_a_row_of_returns(report):
     assert [row[0] for row in rows] == [
         f"{place}/dynamic, static", f"the paper's {place}", "cheetah-run/expert/none", "the paper's cheetah-run/expert"
     ]  # fmt: skip
+
+
+def test_encoders_of_data_without_a_hold_out_have_no_row_of_errors(release):
+    cell = plan_benchmark("b1", Release.open(release), ["bc"])[0][0]
+    none = dict.fromkeys(("observation_mse", "state_mse", "state_l1"))
+    some = {"observation_mse": 0.5, "state_mse": 1.0, "state_l1": {"height": 0.25}}
+    rows = _inspection([(cell, {"inspection": found}) for found in (none, some, None)])
+    assert rows == [("bc", "walker-walk/expert/dynamic", "0.5000", "1.0000", "height 0.250")]
 
 
 @pytest.mark.slow
