@@ -67,7 +67,7 @@ def reader(tmp_path_factory):
     server.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_block_of_a_page_runs_after_the_pages_before_it(page, reader):
     folder, environment = reader
@@ -112,7 +112,7 @@ def test_the_pages_show_every_example():
     assert shown == {str(path.relative_to(ROOT)) for path in (ROOT / "docs/examples").rglob("*.py")}
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_site_builds_without_a_warning_and_shows_every_command(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],

@@ -12,7 +12,7 @@ import pytest
 NOTEBOOK = Path(__file__).parent.parent / "docs/examples/tour.ipynb"
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_tour_runs_and_its_policy_learns(tmp_path, monkeypatch):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

@@ -275,7 +275,7 @@ def test_an_agent_that_cannot_be_loaded_is_one_line(small_release, tmp_path, nam
     assert result.exit_code != 0 and told in result.output
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("example", ["evaluate_torch", "evaluate_jax"])
 def test_examples_train_and_score_a_policy(small_release, example):
     pytest.importorskip("jax" if "jax" in example else "torch")

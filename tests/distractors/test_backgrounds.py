@@ -205,7 +205,7 @@ def test_a_missing_decoder_says_what_to_install(tmp_path, monkeypatch):
         load_backgrounds(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_made_clip_is_a_video(tmp_path):
     pytest.importorskip("mujoco.egl")
     script = Path(__file__).parents[2] / "scripts" / "make_clips.py"

@@ -19,7 +19,7 @@ def run(*arguments):
     return invoke("regenerate", *arguments)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("name", shipped_manifests())
 def test_a_random_shard_of_each_has_the_released_bytes(name, tmp_path):
     known = load_shipped(name)

@@ -25,7 +25,7 @@ TINY = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("task_id", SUITE)
 def test_a_suite_task_goes_the_whole_way(task_id, tmp_path):
     folder, task = tmp_path / "release", get_task(task_id)

@@ -33,7 +33,7 @@ def releases(tmp_path_factory):
     return {name: str(folder / name) for name in SUBSETS}
 
 
-@pytest.mark.slow_cases("bc_jax", "bc_torch")
+@pytest.mark.full
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_is_short_and_learns_its_data(example, releases):
     assert len(example.read_text().splitlines()) < 55

@@ -84,7 +84,7 @@ def evaluated(*arguments):
     return result.output
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_one_command_sets_every_bundled_level_beside_the_paper():
     rows = json.loads(evaluated("--episodes", 2, "--json"))
     asked = [

@@ -70,7 +70,7 @@ def batch_of(count=64, seed=3):
     return rows | {"discount": torch.zeros(count), "next_observation": torch.randn(count, 3)}
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_it_finds_the_action_that_pays():
     mpo_learner = learner(learning_rate=3e-3, epsilon_mean=0.05, epsilon_std=0.01, target_period=20)
     for seed in range(1500):
