@@ -56,13 +56,15 @@ def test_a_policy_is_scored_as_its_data_are_and_normalized_by_them(levels):
     assert (told[random], told[expert]) == pytest.approx((0, 100))
 
 
-def test_what_cannot_be_made_is_refused_in_a_line(levels):
+def test_what_cannot_be_made_or_scored_is_refused_in_a_line(levels, small_mazes):
     folder, (random, _) = levels
+    fixed = dmcvb_gen.open(small_mazes)["ant-maze-tiny/random/fixed"]
     for call, words in (
         (lambda: dmcvb_gen.make("walker-walk"), "'walker-walk' names no subset; give TASK/LEVEL/SETTING"),
         (lambda: dmcvb_gen.make(random, release=folder, size=32), "size has no effect: with a release"),
         (lambda: dmcvb_gen.make(random, release=folder, episodes=1), "has 1 episodes; give 2 or more"),
         (lambda: dmcvb_gen.make(random, release=folder, held_out=1.5), "held_out is 1.5"),
+        (lambda: fixed.evaluate(print), "has fixed goals; score policies on them by `validate --benchmark b3`"),
     ):
         with pytest.raises(DmcvbError, match=words):
             call()

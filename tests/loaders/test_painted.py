@@ -127,17 +127,6 @@ def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(made
     assert not np.array_equal(first[0], second[0]) and np.array_equal(first[0], third[0])
 
 
-def test_a_source_in_memory_shows_the_subsets_epoch(made):
-    subset = distracted(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample"))
-    source = subset.source(episodes=[int(subset.episodes[0])])
-    before = source[3]["pixels"]
-    assert source.in_memory and source.table is source.table
-    subset.set_epoch(1)
-    assert (source[3]["pixels"] != before).any()
-    subset.set_epoch(0)
-    assert np.array_equal(source[3]["pixels"], before)
-
-
 @pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
 def test_each_data_set_shows_the_epoch_that_it_was_given(made, kind):
     opened = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")

@@ -88,6 +88,10 @@ def test_what_cannot_be_paired_is_refused_in_a_line(made):
         paired(folder / "whole", names, FAMILIES[names[0].split("/")[0]][0])
     with pytest.raises(UnknownNameError, match="stattic"):
         paired(folder / "whole", names, "stattic", "stattic")
+    subset = dmcvb_gen.open(folder / "whole")[names[0]]
+    subset.record = subset.record.model_copy(update={"renderer": {"name": "imported"}})
+    with pytest.raises(DmcvbError, match="was imported and cannot be rendered; name settings that the release holds"):
+        subset.paired(*[FAMILIES[names[0].split("/")[0]][0]] * 2)
 
 
 def knowing(pairs, values):

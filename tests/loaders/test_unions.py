@@ -92,3 +92,5 @@ def test_subsets_of_other_settings_and_unknown_levels_are_no_union(levels):
         release.union(parts[0], parts[1].replace(other[1], other[0]))
     with pytest.raises(UnknownNameError, match="unknown subset"):
         release[parts[0].replace("random", "medium-expert")]
+    with pytest.raises(DmcvbError, match="is a union; pair its parts"):
+        release.union(*parts).paired(*other)
