@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.commands import export, fetch, publish, validate, verify
-from dmcvb_gen.generate.returns import evaluate_behaviour
 from dmcvb_gen.loaders.register import register_with_gymnasium
-from dmcvb_gen.making import make, paint, regenerate, repaint, rollout
-from dmcvb_gen.training.behaviour import train_behaviour
 from dmcvb_gen.version import __version__
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from dmcvb_gen.benchmarks.evaluate import Score
+    from dmcvb_gen.benchmarks.validate import validate
+    from dmcvb_gen.generate.returns import evaluate_behaviour
     from dmcvb_gen.loaders.release import ReleaseReader
+    from dmcvb_gen.making import make, paint, regenerate, repaint, rollout
+    from dmcvb_gen.release.export import export
+    from dmcvb_gen.release.fetch import fetch
+    from dmcvb_gen.release.publish import publish
+    from dmcvb_gen.release.verify import verify
+    from dmcvb_gen.training.behaviour import train_behaviour
+
 __all__ = [
     "__version__",
     "evaluate",
@@ -33,6 +39,24 @@ __all__ = [
     "validate",
     "verify",
 ]
+ROOMS = {
+    "making": ("make", "rollout", "paint", "repaint", "regenerate"),
+    "training.behaviour": ("train_behaviour",),
+    "generate.returns": ("evaluate_behaviour",),
+    "release.verify": ("verify",),
+    "release.publish": ("publish",),
+    "release.fetch": ("fetch",),
+    "release.export": ("export",),
+    "benchmarks.validate": ("validate",),
+}
+"""Module -> its public functions, imported when they are used, so that a command loads only what it needs."""
+
+
+def __getattr__(name: str) -> Any:
+    for module, functions in ROOMS.items():
+        if name in functions:
+            return getattr(importlib.import_module(f"dmcvb_gen.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -332,7 +332,7 @@ def regenerate(
     workers: Workers | None = None,
     progress: bool = True,
 ) -> "Outcome":
-    """Make a release's shards again from its manifest alone, bit for bit: to repair, to check, or into `out`.
+    """Regenerate a release's shards from its manifest alone, bit for bit: to repair, to check, or into `out`.
 
     Args:
       release (RELEASE): Folder of the release.

@@ -102,3 +102,17 @@ def progress_bar(shown: bool, unit: str, name: str | None = None, scaled: bool =
 
     with ProgressBar(shown, unit=unit, unit_scale=scaled, desc=name) as bar:
         yield bar
+
+
+def refuse(reason: str, **given: Any) -> None:
+    """Refuse options that have no effect.
+
+    Args:
+      given: flag -> value, which refuses nothing if it is false.
+
+    Raises:
+      DmcvbError: one of them is given.
+    """
+    for name, value in given.items():
+        if value:
+            raise DmcvbError(f"--{name} has no effect: {reason}; remove it")

@@ -46,10 +46,9 @@ FLOORS = (
     ("training", "agents"),
     ("generate",),
     ("loaders",),
+    ("making",),
     ("release",),
     ("benchmarks",),
-    ("making",),
-    ("commands",),
     ("cli",),
 )
 """From the ground up; a module may import from its own floor (its own package there) and those below."""

@@ -28,7 +28,7 @@ from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.release.verify import verify
+from dmcvb_gen.release.verify import verify_folder
 from dmcvb_gen.spec import CUE, DISTRACTOR_KINDS, FIXED, DistractorSetting
 from dmcvb_gen.tasks import get_task
 
@@ -237,7 +237,7 @@ def check_structure(
     not_ours = {name for record in all_records for name in (record.name, *record.layers)} - ours
     tick = _Longer(tick, 2 * len(release.subsets) - len(all_records))  # labels follow; of others bytes alone count
     with open_pool(workers, tick=tick) as pool:
-        verified = verify(release.path, backgrounds, tick, pool, names=release.subsets)
+        verified = verify_folder(release.path, backgrounds, tick, pool, names=release.subsets)
         findings, warnings = [f for f in verified.findings if f.subset not in not_ours], [*verified.unchecked]
         unreadable = {f.subset for f in findings if f.check in ("files", "shapes", "lengths", "finite")}
         subsets = release.subsets.values()

@@ -67,7 +67,7 @@ CHECKS = {
     "states": "physics states give the stored states",
     "rewards": "physics gives the stored rewards",
     "physics": "stored actions lead to the stored physics states",
-    "pixels": "sampled frames painted again are the stored ones",
+    "pixels": "sampled frames render to the stored ones",
     "pictures": "no black or one-colored images",
     "labels": "distractor labels fit their setting",
     "modalities": "depth, segmentation and the like, if stored, are what the states show",
@@ -255,7 +255,7 @@ def plan_validation(
     idle = [name for name in agents if (agent := parse_agent(name)).pretrain is None and agent not in used]
     if benchmarks and idle:
         raise DmcvbError(
-            f"{' and '.join(benchmarks)}: agents with a pre-trained encoder are set beside bc, and "
+            f"{' and '.join(benchmarks)}: agents with a pre-trained encoder are compared with bc, and "
             f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} none; remove "
             f"{'it' if len(idle) == 1 else 'them'}, or add --benchmark b1"
         )

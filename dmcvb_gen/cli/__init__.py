@@ -25,10 +25,10 @@ GROUPS = {
     "Make data": {
         "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of episodes."),
         "cluster": ("rollout:cluster", "Make a release on many machines: begin, part, finish, slurm."),
-        "status": ("look:status", "Show the progress of a release that is being made."),
+        "status": ("look:status", "Show the progress of an unfinished release."),
         "paint": ("paint:paint", "Render the images of a release stored without pixels."),
-        "repaint": ("release:repaint", "Render stored episodes again: other distractors, size or renderer."),
-        "regenerate": ("release:regenerate", "Generate a release again from its manifest: check, repair or copy."),
+        "repaint": ("release:repaint", "Render stored episodes with other distractors, size or renderer."),
+        "regenerate": ("release:regenerate", "Check, repair or copy a release by regenerating its shards."),
     },
     "Train policies": {
         "train-behaviour": ("behaviours:train_behaviour", "Train a behaviour policy online on states."),
@@ -37,7 +37,7 @@ GROUPS = {
     },
     "Look and check": {
         "list": ("look:list_command", "List tasks, levels, distractors, recipes and renderers."),
-        "info": ("look:info", "Show what a release holds, beside the paper's returns."),
+        "info": ("look:info", "Show subsets, size and returns of a release; the paper's returns."),
         "preview": ("look:preview", "Write a contact sheet and a video of a release."),
         "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
         "verify": ("release:verify", "Check every file, value, state and image of a release."),
@@ -51,7 +51,7 @@ GROUPS = {
     },
     "Convert": {
         "convert-policy": ("behaviours:convert_policy", "Convert a policy of Stable-Baselines3 or torch (CleanRL)."),
-        "export": ("release:export", "Write subsets in another format: HDF5, Minari, LeRobot, RLDS, ..."),
+        "export": ("release:export", "Write subsets as HDF5, Minari, LeRobot, RLDS, Zarr, ..."),
         "import": ("release:import_command", "Import DMC-VB's published TFDS folders into a release."),
     },
 }

@@ -13,7 +13,6 @@ import click
 
 from dmcvb_gen.cli.common import INTERRUPTED, OutPath, answer, json_option, print_json, print_table
 from dmcvb_gen.cli.options import command_of
-from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.generate.returns import evaluate_behaviour as evaluate
 from dmcvb_gen.progress import ProgressBar
@@ -35,8 +34,8 @@ def train_behaviour(as_json, list_settings, **options):
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk
     dmcvb-gen train-behaviour walker-walk --out runs/walker-walk --resume
     dmcvb-gen train-behaviour cheetah-run --algo sb3:TQC --list-settings
-    dmcvb-gen train-behaviour cheetah-run --algo sb3:TQC --set gradient_steps=8 --out runs/cheetah-tqc
-    dmcvb-gen train-behaviour ant-maze-medium7x7a --algo guided --out runs/ant-maze-medium7x7a
+    dmcvb-gen train-behaviour cheetah-run --algo sb3:TQC --set gradient_steps=8
+    dmcvb-gen train-behaviour ant-maze-medium7x7a --algo guided --out runs/ant
     dmcvb-gen train-behaviour --layout ring.txt --out runs/ring
     dmcvb-gen select-checkpoints runs/walker-walk
     """
@@ -71,13 +70,12 @@ def _leave(task):
     return f"{TASKS}={task} " if task and is_own(task) else ""
 
 
-def _list_settings(as_json, *, task, layout, algo, settings, **others):
+def _list_settings(as_json, *, task, layout, algo, settings, **_):
     """Print every setting, its value for the task and what it means."""
     from dmcvb_gen.tasks import get_task
     from dmcvb_gen.training.behaviour import task_of
     from dmcvb_gen.training.settings import check_settings, default_run, describe_settings, parse_settings
 
-    refuse(click.get_current_context(), tuple(others), "--list-settings trains nothing")
     task, algorithm = get_task(task_of(task, layout)).id, algo or ("guided" if layout else "sac")
     given = parse_settings(settings, algorithm)
     values = dataclasses.asdict(check_settings(algorithm, default_run(task, algorithm)["settings"] | given))
@@ -107,7 +105,7 @@ def select_checkpoints(run, episodes, seed, sample, as_json):
 
     \b
     dmcvb-gen select-checkpoints runs/walker-walk
-    dmcvb-gen rollout walker-walk --level expert --behaviour runs/walker-walk --episodes 20
+    dmcvb-gen rollout walker-walk --level expert --behaviour runs/walker-walk
     """
     from dmcvb_gen.training.selection import select_checkpoints as select
     from dmcvb_gen.training.selection import selection_json
@@ -173,8 +171,9 @@ def convert_policy(source, task, out, level, activation, distribution, statistic
 
     \b
     dmcvb-gen convert-policy model.zip walker-run --out walker-run.safetensors
-    dmcvb-gen convert-policy ppo.pt hopper-hop --statistics observations.npz --out hopper-hop.safetensors
-    dmcvb-gen rollout walker-run --level expert --behaviour walker-run.safetensors --episodes 20
+    dmcvb-gen convert-policy ppo.pt hopper-hop --statistics observations.npz \\
+        --out hopper-hop.safetensors
+    dmcvb-gen rollout walker-run --behaviour walker-run.safetensors
     """
     from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.bundled import CONVERTED
@@ -205,8 +204,8 @@ def evaluate_behaviour(as_json, progress, **options):
 
     \b
     dmcvb-gen evaluate-behaviour
-    dmcvb-gen evaluate-behaviour walker-walk --level expert --episodes 100 --seed 1 --json
-    dmcvb-gen evaluate-behaviour ant-maze-easy7x7a --level expert --level medium --pictures paths
+    dmcvb-gen evaluate-behaviour walker-walk --level expert --seed 1 --json
+    dmcvb-gen evaluate-behaviour ant-maze-easy7x7a --pictures paths
     """
     rows = evaluate(**options)
     if as_json:

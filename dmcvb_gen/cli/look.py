@@ -16,7 +16,6 @@ from dmcvb_gen.cli.common import (
     print_table,
     remote_option,
 )
-from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.storage.places import is_url, shown
 from dmcvb_gen.text import format_bytes, pluralize, quoted
 
@@ -26,7 +25,7 @@ from dmcvb_gen.text import format_bytes, pluralize, quoted
 @remote_option
 @json_option
 def info(path, options, as_json):
-    """Show the subsets, episodes, bytes and returns of a release beside the paper's.
+    """Show the subsets, episodes, bytes and returns of a release, and the paper's returns.
 
     \b
     dmcvb-gen info releases/demo
@@ -55,26 +54,43 @@ def info(path, options, as_json):
         if paper := subset["paper"]:
             numbers = (f"{paper[key]:.1f}" for key in statistics)
             rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers, ""))
-    rows += [(name, f"0/{planned:,}", *[""] * 11) for name, planned in facts["missing"].items()]
+    title = f"{facts['name']} {facts['version']}"
+    if facts["part"]:
+        title = f"part of {title} ({facts['digest'][:12]})"
+    elif not facts["complete"]:
+        title += " (not complete)"
     print_table(
         ("subset", "episodes", "steps", "size", "B/step", *statistics, "score"),
         rows,
-        title=f"{facts['name']} {facts['version']}" + ("" if facts["complete"] else " (not complete)"),
+        title=title,
         optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("score",), ("size",), ("median",)),
     )
-    size = format_bytes(facts["bytes"])
-    click.echo(f"{facts['steps']:,} steps, {size}")
+    click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}")
+    if facts["missing"]:
+        count = len(facts["missing"])
+        click.echo(f"{count:,} of {pluralize(count + len(facts['subsets']), 'subsets')} have no local episodes.")
+    for line in dict.fromkeys(_look_of(subset) for subset in facts["subsets"]):
+        click.echo(f"images: {line}")
+    policies = dict.fromkeys(name for subset in facts["subsets"] for name in subset["policies"])
+    if policies:
+        click.echo(textwrap.fill(f"policies: {', '.join(policies)}", 80, break_on_hyphens=False))
     if any(subset["paper"] and subset["other_length"] for subset in facts["subsets"]):
         click.echo("* Episodes have another length than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
         paint = f"fetch {shown(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(path)}"
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
-    if facts["complete"] and (facts["missing"] or not all(subset["complete"] for subset in facts["subsets"])):
-        click.echo(f"Episodes are missing or damaged; see which: dmcvb-gen verify {quoted(shown(path))}")
     if facts["digest"]:
         click.echo(f"digest {facts['digest']}")
         if not facts["compared"]:
             click.echo("The digest was not compared; give the one that you expect: RELEASE@sha256:DIGEST")
+
+
+def _look_of(subset) -> str:
+    """Size, renderer and videos of a subset's images."""
+    videos = subset["videos"]
+    shown = f"; videos: {videos['source']} ({videos['split']})" if videos else ""
+    samples = f", {subset['samples']} samples a pixel" if subset["samples"] else ""
+    return f"{subset['size']} x {subset['size']} pixels, {subset['renderer']}{samples}{shown}"
 
 
 @click.command()
@@ -106,16 +122,11 @@ def preview(path, only, out, as_json, **options):
 
 
 @click.command("list")
-@click.option("--remote", metavar="URL", help="List the releases at a URL instead.")
-@remote_option
 @json_option
-def list_command(remote, options, as_json):
+def list_command(as_json):
     """List tasks, levels, distractors, bundled policies, recipes and the renderers that work here."""
     from dmcvb_gen.generate.info import describe_package
 
-    if remote:
-        return _list_remote(remote, options, as_json)
-    refuse(click.get_current_context(), ("options",), "it is for --remote")
     facts = describe_package()
     if as_json:
         return print_json(facts)
@@ -149,27 +160,12 @@ def list_command(remote, options, as_json):
         click.echo(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
 
 
-def _list_remote(url, options, as_json) -> None:
-    from dmcvb_gen.release.catalog import releases_at
-
-    found = releases_at(url, options)
-    if as_json:
-        return print_json(found)
-    columns = ("url", "name", "version", "subsets", "episodes")
-    print_table(
-        ("release", "<name", "<version", "subsets", "episodes", "<digest"),
-        [(*(str(facts[key]) for key in columns), facts["digest"][:12]) for facts in found],
-        title=shown(url),
-        optional=(("subsets",), ("name",)),
-    )
-
-
 @click.command()
 @click.argument("place", metavar="RELEASE|URL")
 @remote_option
 @json_option
 def status(place, options, as_json):
-    """Show the progress of a release that is being made: shards done and late, time left.
+    """Show the progress of an unfinished release: shards done and late, time left.
 
     It reads the records, so it works from any machine.
 

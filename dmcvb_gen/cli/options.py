@@ -15,15 +15,16 @@ switched off (pixels: --no-pixels). With `workers` come --executor and --ray-add
 
 import functools
 import inspect
+import math
 import re
 import typing
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import click
+from click.core import ParameterSource
 
 from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
-from dmcvb_gen.cli.unused_options import is_given
 from dmcvb_gen.options import LOCAL, parts_of
 from dmcvb_gen.parallel import Ray, Workers
 
@@ -126,8 +127,19 @@ def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
         for name, (side, is_open) in sides.items():
             if hasattr(limit, name):
                 bounds |= {side: getattr(limit, name), f"{side}_open": is_open}
-    plain, ranged = (float, click.FloatRange) if float in kinds else (int, click.IntRange)
-    return ranged(**bounds) if bounds else plain
+    if float in kinds:
+        return Finite(**bounds)
+    return click.IntRange(**bounds) if bounds else int
+
+
+class Finite(click.FloatRange):
+    """A number that is neither infinite nor nan."""
+
+    def convert(self, value, param, ctx):
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
 
 
 def _repeatable(text: str) -> str:
@@ -152,7 +164,7 @@ def _executor(workers: int, executor: str, address: str | None) -> Workers:
       click.UsageError: an option has no effect with this executor.
     """
     if executor == "ray":
-        if is_given(click.get_current_context(), "workers"):
+        if click.get_current_context().get_parameter_source("workers") == ParameterSource.COMMANDLINE:
             raise click.UsageError(
                 "--workers has no effect with --executor ray, which uses every core of the cluster: remove it."
             )

@@ -6,9 +6,11 @@ import dataclasses
 
 import click
 
-from dmcvb_gen import commands, making
+from dmcvb_gen import making
 from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.release.fetch import download
+from dmcvb_gen.release.fetch import fetch as run_fetch
 from dmcvb_gen.text import pluralize
 
 
@@ -21,7 +23,7 @@ def paint(release, as_json, **options):
     from the known ones.
 
     \b
-    dmcvb-gen rollout walker-walk --level expert --episodes 20 --no-pixels --out releases/light
+    dmcvb-gen rollout walker-walk --no-pixels --out releases/light
     dmcvb-gen paint releases/light --workers 2
     """
     done = making.paint(release, notify=_tell, **options)
@@ -29,17 +31,17 @@ def paint(release, as_json, **options):
     answer(as_json, facts, *_painted(release, done), code=1 if done.differing else 0)
 
 
-@command_of(commands.fetch)
+@command_of(run_fetch)
 def fetch(as_json, **options):
     """Download a published release, or a part of it. Rerun the command to resume or to add more.
 
     With --paint, images are rendered during the download; the exit code is 1 if they differ from the published ones.
 
     \b
-    dmcvb-gen fetch s3://bucket/dmcvb-mini --only 'walker-walk/expert/*' --range 0:200 --out data/mini
-    dmcvb-gen fetch s3://bucket/dmcvb-mini-light --paint --size 84 --out data/mini84
+    dmcvb-gen fetch s3://bucket/mini --only 'walker-walk/*' --out data/mini
+    dmcvb-gen fetch s3://bucket/light --paint --size 84 --out data/mini84
     """
-    moved, done = commands.download(options, notify=_tell)
+    moved, done = download(options, notify=_tell)
     out, episodes = options["out"], options["episode_range"]
     facts = dataclasses.asdict(moved) | (_painted_facts(done) if done else {})
     lines = [f"{out}: {moved_files(moved)}", *(_whole_shards(out, episodes) if episodes else ())]
@@ -61,7 +63,7 @@ def _whole_shards(out, episodes):
 
 
 def _tell(text):
-    """Say beside the output what is other here than where the release was made."""
+    """Print a difference to the machine that made the release, apart from the output."""
     click.echo(f"note: {text}", err=True)
 
 
@@ -79,18 +81,20 @@ def _painted_facts(done):
 
 def _painted(place, done):
     """Yield the result of painting in lines."""
-    painted = f"{pluralize(done.shards, 'shards')} painted; {_compared(done)}."
-    yield f"{place}: {painted if done.shards else 'every shard that is here has its images already.'}"
+    rendered = f"Rendered {pluralize(done.shards, 'shards')}. {_compared(done)}."
+    yield f"{place}: {rendered if done.shards else 'All local shards have images already.'}"
     yield from (f"  differs: {name}" for name in done.differing[:10])
     if done.differing:
         yield (
-            "  what differs here is noted above" if done.drift else "  versions and processor are those of the release"
+            "  The notes above name what differs from the machine of the release."
+            if done.drift
+            else "  Versions and processor are the same as the release's."
         )
 
 
 def _compared(done) -> str:
     if not done.known:
-        return "no digests of these images were known"
+        return "This release has no image digests to compare with"
     if done.differing:
-        return f"{len(done.differing)} of {done.known} differ from the known digests"
-    return f"equal to the known digests ({done.known} of {done.shards})"
+        return f"MISMATCH: {len(done.differing)} of {done.known} shards have other digests than the release"
+    return f"{done.known} of {done.shards} have the digests of the release"

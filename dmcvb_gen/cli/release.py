@@ -7,29 +7,32 @@ from pathlib import Path
 
 import click
 
-from dmcvb_gen import commands, making
+from dmcvb_gen import making
 from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, remote_option
 from dmcvb_gen.cli.options import command_of
-from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.dataset.manifest import VIDEOS
+from dmcvb_gen.options import progress_bar, refuse
+from dmcvb_gen.release.export import export as run_export
 from dmcvb_gen.release.issue import NOT_PART
+from dmcvb_gen.release.publish import publish as run_publish
+from dmcvb_gen.release.verify import verify as run_verify
 from dmcvb_gen.storage.places import is_url, shown
 from dmcvb_gen.text import pluralize, quoted
 
 
-@command_of(commands.verify)
+@command_of(run_verify)
 def verify(release, as_json, **options):
     """Check a release: digests, shapes, values, physics, pixels, returns.
 
     At a URL nothing is downloaded: the manifest and its lists are checked, and a sample of files by digest.
 
-    Exit codes: 0: sound and complete. 1: a check failed. 2: bad usage. 3: sound, but a part is missing (a rollout that
-    is not finished, or a part that was fetched) or could not be checked here.
+    Exit codes: 0: complete, and all checks passed. 1: a check failed. 2: bad usage. 3: all checks passed, but a part
+    is missing (an unfinished rollout, or a fetched part) or could not be checked on this machine.
 
     \b
     dmcvb-gen verify releases/demo
     """
-    result = commands.verify(release, **options)
+    result = run_verify(release, **options)
     facts = {name: getattr(result, name) for name in ("sound", "complete", "digest", "compared", "checked")}
     facts |= {"findings": [dataclasses.asdict(finding) for finding in result.findings], "incomplete": result.incomplete}
     facts |= {"unchecked": [dataclasses.asdict(issue) for issue in result.unchecked]}
@@ -71,23 +74,23 @@ def _cures(path, places):
         return
     videos = {place for place in places if place.startswith(VIDEOS)}
     if places - videos:
-        yield f"`dmcvb-gen regenerate {quoted(path)}` makes damaged and missing shards again."
+        yield f"`dmcvb-gen regenerate {quoted(path)}` repairs damaged and missing shards."
     if videos:
-        yield f"`dmcvb-gen regenerate {quoted(path)} --backgrounds FOLDER` copies the videos from FOLDER again."
+        yield f"`dmcvb-gen regenerate {quoted(path)} --backgrounds FOLDER` restores the videos from FOLDER."
 
 
 @command_of(making.regenerate)
 def regenerate(release, out, as_json, **options):
-    """Make a release's shards again from its manifest alone, bit for bit.
+    """Regenerate a release's shards from its manifest alone, bit for bit.
 
-    Without --check and --out it repairs damaged and missing shards in place. If only a part is here, it repairs that
-    part. Exit code 1 if a shard comes out different: the command then says what differs in the environment, and
-    how far the values are apart. With --check, exit code 3 if all shards here match, but some shards are missing.
+    Without --check and --out it repairs damaged and missing shards in place; of a fetched part, those of the part.
+    Exit code 1 if a shard has another digest: the output lists the differences of the environment and of the values.
+    With --check, exit code 3 if all local shards match, but others are missing.
 
     \b
-    dmcvb-gen regenerate releases/mini --only 'walker-walk/expert/dynamic' --range 100:150 --check
+    dmcvb-gen regenerate releases/mini --only '*/expert/*' --range 0:50 --check
     dmcvb-gen regenerate releases/mini
-    dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --range 0:3 --out data/part
+    dmcvb-gen regenerate --manifest quickstart --range 0:3 --out data/part
     """
     outcome = making.regenerate(release, out=out, **options)
     facts = {"sound": outcome.sound, "shards": [dataclasses.asdict(shard) for shard in outcome.shards]}
@@ -101,35 +104,35 @@ def _regenerated(place, outcome):
     yield from outcome.shards
     if any(shard.equal is False for shard in outcome.shards):
         for name, (there, here) in outcome.environment.items():
-            yield f"environment: {name} was {there}, is {here}"
+            yield f"environment: {name} was {there} and is {here} on this machine"
         if not outcome.environment:
-            yield "environment: the same versions and processor as when the release was made"
+            yield "environment: same versions and processor as the release's"
     if outcome.restored:
         files = pluralize(len(outcome.restored), "other files")
-        yield f"{place}: {files} put back, e.g. {outcome.restored[0]}"
+        yield f"{place}: restored {files}, e.g. {outcome.restored[0]}"
     if outcome.shards:
-        left = f"; {outcome.left} more not here" if outcome.left else ""
-        yield f"{place}: {pluralize(len(outcome.shards), 'shards')} made again{left}"
+        left = f"; {outcome.left} others have no local files" if outcome.left else ""
+        yield f"{place}: regenerated {pluralize(len(outcome.shards), 'shards')}{left}"
     elif not outcome.restored:
-        yield f"{place}: " + ("none of these shards is here" if outcome.left else "nothing is damaged or missing")
+        yield f"{place}: {'this copy has none of these shards' if outcome.left else 'no shard is damaged or missing'}"
 
 
 @command_of(making.repaint)
 def repaint(release, out, as_json, **options):
-    """Render stored episodes again from their physics states. Nothing is simulated.
+    """Render stored episodes from their physics states into a new release. Nothing is simulated.
 
     \b
-    dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static --size 84 --renderer opengl \\
-        --out releases/mini84
+    dmcvb-gen repaint releases/mini --only '*/*/none' --distractor static \\
+        --size 84 --renderer opengl --out releases/mini84
     """
     release = making.repaint(release, out=out, **options)
     subsets = release.manifest.subsets
     facts = {"out": out, "complete": not release.shortfalls, "subsets": [subset.name for subset in subsets]}
     made = (f"{subset.name}: {subset.size} pixels, {subset.renderer['name']}" for subset in subsets)
-    answer(as_json, facts, *made, f"{out}: repainted; look at it: dmcvb-gen preview {quoted(out)}")
+    answer(as_json, facts, *made, f"{out}: rendered; look at it: dmcvb-gen preview {quoted(out)}")
 
 
-@command_of(commands.publish, "release", "url")
+@command_of(run_publish, "release", "url")
 def publish(release, url, as_json, **options):
     """Upload a complete release: every file is checked, and the manifest comes last.
 
@@ -141,7 +144,7 @@ def publish(release, url, as_json, **options):
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini-light --no-pixels
     """
-    moved = commands.publish(release, url, **options)
+    moved = run_publish(release, url, **options)
     answer(as_json, dataclasses.asdict(moved), f"{shown(url)}: {moved_files(moved)}")
 
 
@@ -157,32 +160,32 @@ def card(path, check, out, url, as_json):
     The table, card/episodes.parquet, has one row for each episode, with its first frame. `datasets.load_dataset` reads
     it.
 
-    With --check, exit code 1 when the card does not fit the data, 3 when it fits the part that was fetched.
+    With --check, exit code 1 if the card does not match the data; of a fetched part, the table's rows are compared.
 
     \b
     dmcvb-gen card releases/mini
     """
-    from dmcvb_gen.release.card import check_card, left_unchecked, write_card
+    from dmcvb_gen.release.card import check_card, write_card
 
     if check:
-        refuse(click.get_current_context(), ("out", "url"), "--check writes no card")
-        findings, left = check_card(path), left_unchecked(path)
-        fits = f"{path}: the card fits " + (f"the episodes that are here; {left:,} are not" if left else "the release")
-        return answer(as_json, findings, *(findings or [fits]), code=1 if findings else 3 if left else 0)
+        refuse("--check writes no card", out=out, url=url)
+        findings = check_card(path)
+        lines = findings or [f"{path}: the card matches the data"]
+        return answer(as_json, findings, *lines, code=1 if findings else 0)
     files = list(map(str, write_card(path, out, url)))
     answer(as_json, files, *files)
 
 
-@command_of(commands.export)
+@command_of(run_export)
 def export(release, to, out, as_json, **options):
     """Write subsets in another format: a folder for each subset. Rerun the command to resume.
 
-    An incomplete subset is refused, unless --range names what is there.
+    An incomplete subset is refused, unless --range selects episodes that exist.
 
     \b
-    dmcvb-gen export releases/mini --to hdf5 --only 'walker-walk/*/none' --out exports/mini
+    dmcvb-gen export releases/mini --to hdf5 --only '*/*/none' --out exports/h5
     """
-    folders = commands.export(release, to, out, **options)
+    folders = run_export(release, to, out, **options)
     shown = [str(Path(out) / folder.relative_to(Path(out).absolute())) for folder in folders]  # as --out names them
     answer(as_json, shown, *shown)
 
@@ -193,7 +196,7 @@ def export(release, to, out, as_json, **options):
 @click.option("--level", help="Level of such a folder.")
 @click.option("--setting", help="Setting of such a folder: none, static_medium, dynamic_medium, ...")
 @click.option("--name", default="dmc-vb-original", show_default=True, help="Name of the new release.")
-@click.option("--partial", is_flag=True, help="Import the files that are there, even if some are missing.")
+@click.option("--partial", is_flag=True, help="Import the files found, even if some are missing.")
 @click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")
 @json_option
 def import_command(folder, task, level, setting, name, partial, out, as_json):
@@ -206,7 +209,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
     """
     from dmcvb_gen.release.import_tfds import import_tfds
 
-    with commands.progress_bar(not as_json, " episodes", scaled=False) as bar:
+    with progress_bar(not as_json, " episodes", scaled=False) as bar:
         given = dict(task=task, level=level, setting=setting, name=name, partial=partial, progress=bar)
         manifest = import_tfds(folder, out, **given).manifest
     made = (f"{subset.name}: {pluralize(subset.episodes, 'episodes')}" for subset in manifest.subsets)
@@ -221,7 +224,7 @@ def import_command(folder, task, level, setting, name, partial, out, as_json):
 def diff_command(one, other, options, as_json):
     """Compare two releases by their manifests and records: subsets, episodes and digests.
 
-    Exit code 0 when nothing differs, 1 when something does.
+    Exit code 0 if they are equal, 1 if not.
 
     \b
     dmcvb-gen diff releases/mini s3://bucket/dmcvb-mini

@@ -25,13 +25,16 @@ OPTION_GROUPS = {
 DISTRACTORS = """
 \b
 Distractors:
-  none                       the model's own colors, camera and sky
-  static, dynamic            drawn once an episode, or changing; at strength medium (0.2)
-  dynamic_easy, dynamic_hard strengths 0.1 and 0.3, with 4 and all background videos
-  dynamic_0.35               any strength up to 1
-  dynamic_camera0.1          only these parts vary: camera, color, background, shake, light,
-  static_color-background4   each with a strength of its own; of a background, the number of videos
-  dynamic_color-cue0.8       also a cue that correlates with the last action
+  none                      the model's own colors, camera and sky
+  static                    drawn once an episode, at strength medium (0.2)
+  dynamic                   changes in every frame
+  dynamic_easy              strength 0.1 and 4 background videos
+  dynamic_hard              strength 0.3 and all background videos
+  dynamic_0.35              any strength up to 1
+  dynamic_camera0.1         only this part varies, with its own strength;
+                            parts: camera, color, background, shake, light
+  static_color-background4  two parts; of a background, the number of videos
+  dynamic_color-cue0.8      a cue that correlates with the last action
 """
 
 
@@ -42,7 +45,7 @@ def _with_table(command: click.Command) -> click.Command:
 
 @_with_table
 @command_of(making.rollout, groups=OPTION_GROUPS)
-@click.option("--dry-run", is_flag=True, help="Show what is there and what would be made, and write nothing.")
+@click.option("--dry-run", is_flag=True, help="List finished and remaining shards; write nothing.")
 def rollout(dry_run, as_json, progress, workers, other_versions, **options):
     """Roll out behaviour policies into a release of episodes.
 
@@ -53,8 +56,8 @@ def rollout(dry_run, as_json, progress, workers, other_versions, **options):
     \b
     dmcvb-gen rollout walker-walk --distractor dynamic --episodes 8
     dmcvb-gen rollout walker-walk cheetah-run --level expert --level medium \\
-        --distractor none --distractor static --distractor dynamic --episodes 20 --out releases/mine
-    dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static' --out releases/mini
+        --distractor none --distractor dynamic --out releases/mine
+    dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static'
     """
     from dmcvb_gen.generate.counts import check_room
     from dmcvb_gen.generate.plan import start
@@ -73,7 +76,7 @@ def cluster():
 
     \b
     dmcvb-gen cluster begin --recipe dmcvb-v1 --out s3://bucket/mine
-    dmcvb-gen cluster part s3://bucket/mine 1/64        # on each machine, 1/64 to 64/64
+    dmcvb-gen cluster part s3://bucket/mine 1/64    # 1/64 to 64/64, anywhere
     dmcvb-gen cluster finish s3://bucket/mine
     """
 
@@ -111,7 +114,7 @@ def part(release, part, as_json, workers, other_versions, only, episode_range, s
 @remote_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
 def finish(release, options, as_json):
-    """Write the manifest of all that is there. Exit code 1 while shards are missing."""
+    """Write the manifest of all finished shards. Exit code 1 while shards are missing."""
     from dmcvb_gen.dataset.gate import Release
     from dmcvb_gen.dataset.writer import finish as write
     from dmcvb_gen.storage.store import open_store
@@ -141,7 +144,7 @@ for subcommand in (begin, part, finish, slurm):
 
 
 def _plan(options):
-    """The plan of a command line, with notes on what is asked for and what is there."""
+    """The plan of a command line, with notes on what is asked for and what exists."""
     from dmcvb_gen.distractors.backgrounds import videos_by_split
     from dmcvb_gen.generate.plan import plan_of
 
@@ -178,7 +181,7 @@ def _run(plan, workers, as_json, whole=True):
     named = shlex.quote(str(place))
     state = "complete" if complete else f"not complete yet (dmcvb-gen status {named} says what is missing)"
     if not whole:
-        state = f"finished with `dmcvb-gen cluster finish {named}` when all parts are there"
+        state = f"finished with `dmcvb-gen cluster finish {named}` when all parts are done"
     rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""
     done = f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}; the release is {state}."
     images = not is_url(str(place)) and any(layer.kind == "images" for layer in release.layers.values())

@@ -2,45 +2,38 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Iterator
 
 import click
 
-from dmcvb_gen import commands
+from dmcvb_gen.benchmarks.validate import validate as run
 from dmcvb_gen.cli.common import answer
 from dmcvb_gen.cli.options import command_of
-from dmcvb_gen.cli.unused_options import refuse
 from dmcvb_gen.own_code import is_own
+from dmcvb_gen.parallel import ignore
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import pluralize
 
 
-@command_of(commands.validate)
+@command_of(run)
 @click.option("--agent", "own", multiple=True, metavar="MODULE:NAME", help="Also score your own agent. Repeatable.")
 @click.option("--strict", is_flag=True, help="Exit with 1 on warnings (data unlike the paper's).")
 def validate(own, strict, as_json, **options):
-    """Check a release and run the paper's benchmarks on it, scores set beside the paper's.
+    """Check a release, run the paper's benchmarks on it and compare the scores with the paper's.
 
-    Exit code 0 when sound and complete, 1 when a check or a cell fails or episodes are missing, 2 on bad usage. Rerun
-    the command to resume.
+    Exit code 0: the release is complete and all checks passed. 1: a check or a cell failed, or episodes are missing.
+    2: bad usage. Rerun the command to resume.
 
     \b
     dmcvb-gen validate releases/mini --profile smoke
-    dmcvb-gen validate releases/mini --profile quick --benchmark b1 --agents bc,state-bc,id+bc --out reports/mini
+    dmcvb-gen validate releases/mini --profile quick --agents bc,id+bc
     """
-    context = click.get_current_context()
-    if options["checks_only"]:
-        refuse(context, (*commands.TRAINING, "own"), "--checks-only trains nothing")
     options["agents"] = _agents(options["agents"], own, options["benchmarks"])
-    budget = commands.validation_budget(options)
-    if options["precision"] == "auto" and not options["checks_only"]:
-        click.echo(f"Networks that see images compute in {budget.precision}, the faster one here.", err=True)
-    on_score = (lambda *_: None) if as_json else functools.partial(_show_score, budget)
-    result = commands.run_validation(budget, options, on_score)
+    result = run(on_score=ignore if as_json else _show_score, **options)
     code = 0 if result.sound and result.complete and not (strict and result.warnings) else 1
-    answer(as_json, json.loads(result.facts.read_text()), *_validated(result, budget), code=code)
+    facts = json.loads(result.facts.read_text())
+    answer(as_json, facts, *_validated(result, facts["budget"]["note"]), code=code)
 
 
 def _show_score(budget, cell, facts) -> None:
@@ -68,7 +61,7 @@ def _agents(names: tuple[str, ...] | None, own: tuple[str, ...], benchmarks: tup
     return [*(names or ()), *(["state-bc"] if beside else []), *own]
 
 
-def _validated(result, budget) -> Iterator[str]:
+def _validated(result, note) -> Iterator[str]:
     """Yield the result of validate in lines."""
     yield from (f"FAIL {finding}" for finding in result.structure.findings[:50])
     yield from (f"FAIL {cell.id}: {error}" for cell, error in result.failed)
@@ -81,5 +74,5 @@ def _validated(result, budget) -> Iterator[str]:
     if not result.complete:
         yield "Incomplete: {:,} of {:,} episodes.".format(*result.episodes)
     if result.results:
-        yield f"Profile {budget.note}"
+        yield f"Profile {note}"
     yield f"Report: {result.report}"

@@ -308,7 +308,7 @@ def _check_unique(names: Collection[str], what: str) -> None:
     seen: set[str] = set()
     for name in names:
         if name.casefold() in seen:
-            raise ValueError(f"{what}: {name!r} is there twice (case is ignored)")
+            raise ValueError(f"{what}: {name!r} appears twice (case is ignored)")
         seen.add(name.casefold())
 
 

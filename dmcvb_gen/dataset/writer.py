@@ -77,7 +77,7 @@ def put(store: Store, path: str, data: bytes | Path, *, first_wins: bool = False
     if there == mine or first_wins:
         return there
     raise StoreError(
-        f"{store.place}/{path} is there with other bytes (SHA-256 {there.sha256[:12]}, made by {makers(store)}) than "
+        f"{store.place}/{path} exists with other bytes (SHA-256 {there.sha256[:12]}, made by {makers(store)}) than "
         f"{_versions(environment())} makes ({mine.sha256[:12]}); use those versions, or choose another place"
     )
 

@@ -107,11 +107,11 @@ class ShardOutcome:
         if self.equal is None:
             return text + "made"
         if self.equal:
-            return text + ("repaired" if self.repaired else "made again with the same digest")
-        text += "made again, other bytes"
+            return text + ("repaired" if self.repaired else "same digest")
+        text += "MISMATCH: digest differs"
         for difference in self.differences:
             if difference.largest is None:
-                text += f"; {difference.array}: how far is unknown, as the released one cannot be read"
+                text += f"; {difference.array}: the original is not available on this machine"
             elif not difference.largest:
                 text += f"; {difference.array}: equal values, only the compression differs"
             else:

@@ -196,7 +196,7 @@ def render_differences(
             if was != now:
                 found[f"{record.renderer['name']}'s {name} is {now} here, {was} in the manifest"] = None
     for name, (there, now) in environment_diff(release.store).items():
-        found[f"{name} is {now} here, {there} where the release was made"] = None
+        found[f"{name} is {now} on this machine and was {there} on the machine of the release"] = None
     return tuple(found)
 
 

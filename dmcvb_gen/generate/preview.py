@@ -154,7 +154,7 @@ def write_preview(
     names = select(list(release.subsets), list(only)) if release.subsets else []
     subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
     if not subsets:
-        cure = f"see what is here: dmcvb-gen verify {quoted(path)}"
+        cure = f"see which episodes exist: dmcvb-gen verify {quoted(path)}"
         if names:
             cure = f"add them: dmcvb-gen paint {quoted(path)}, or see it without: dmcvb-gen view {quoted(path)}"
         raise StoreError(f"{path} has no finished episodes with images; {cure}")

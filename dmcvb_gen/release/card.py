@@ -11,7 +11,7 @@ import json
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from PIL import Image
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest, Resolved
 from dmcvb_gen.dataset.writer import read_provenance
-from dmcvb_gen.distractors import background, camera, color, cue, light, load_backgrounds, shake
+from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.info import describe_release
@@ -43,9 +43,9 @@ from dmcvb_gen.release.croissant import (
 )
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_rows, write_table
 from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
-from dmcvb_gen.release.statistics import level_statistics, states_json
+from dmcvb_gen.release.statistics import states_json
 from dmcvb_gen.release.templates import fill
-from dmcvb_gen.spec import CUE, DISTRACTOR_KINDS, FIXED, LIGHT, SHAKE, DistractorSetting
+from dmcvb_gen.spec import ALL_PARTS, CUE, DISTRACTOR_KINDS, FIXED, DistractorSetting
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.tasks import ACTION_REPEAT
@@ -56,8 +56,6 @@ PLOT, SHEET = f"{CARD_FOLDER}returns.png", f"{CARD_FOLDER}contact_sheet.png"
 STATES = f"{CARD_FOLDER}states.json"
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Hugging Face's size categories, counted in steps."""
-FEW_RETURNS = 20
-"""Episodes of a task and level below which the plot shows each one."""
 CITATION = """@inproceedings{ortiz2024dmcvb,
   title     = {{DMC-VB}: A Benchmark for Representation Learning for Control with Visual Distractors},
   author    = {Ortiz, Joseph and Dedieu, Antoine and Lehrach, Wolfgang and Guntupalli, J. Swaroop and
@@ -132,10 +130,9 @@ def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = No
 
 
 def check_card(root: str | Path) -> list[str]:
-    """List the files of a release's card that are missing or do not fit its data; empty if the card is right.
+    """List the files of a release's card that are missing or do not match its data; empty if the card is right.
 
-    The card of a copy describes the whole release, so only the rows of the episodes that are here are compared (see
-    `left_unchecked`).
+    The card of a copy describes the whole release, so only the rows of its local episodes are compared.
 
     Raises:
       StoreError: there is no release, or it has no episodes.
@@ -147,31 +144,17 @@ def check_card(root: str | Path) -> list[str]:
         names = _write_files(release, made, folder, _published(folder, release.manifest), keep_table=True)
         if release.copy:
             fits = table_rows(made / TABLE) <= table_rows(folder / TABLE)
-            return [] if fits else [f"{TABLE} does not fit the episodes that are here"]
+            return [] if fits else [f"{TABLE} does not match the local episodes"]
         return [
-            f"{name} {'does not fit the release' if (folder / name).is_file() else 'is missing'}"
+            f"{name} {'does not match the release' if (folder / name).is_file() else 'is missing'}"
             for name in names
             if not _same(folder / name, made / name)
         ]
 
 
-def left_unchecked(root: str | Path) -> int:
-    """Number of episodes in the card that are not here, because only a part of the release was fetched."""
-    release = Release.open(root)
-    return sum(planned - here for here, planned in release.shortfalls.values()) if release.copy else 0
-
-
 def _same(path: Path, made: Path) -> bool:
-    """Return True if a card's file says what the one made now says. Of the plot, only that it is there."""
-    if not path.is_file() or path.suffix != ".png":
-        return path.is_file() and path.read_bytes() == made.read_bytes()
-    if path.name == Path(PLOT).name:
-        return True  # other versions of matplotlib draw other pixels
-    try:
-        with Image.open(path) as picture, Image.open(made) as other:  # sizes are compared before decoding
-            return picture.size == other.size and np.array_equal(np.asarray(picture), np.asarray(other))
-    except Exception:  # decoders raise many kinds of errors
-        return False
+    """Return True if a card has this file as it is made now. Pictures need only exist: libraries draw differently."""
+    return path.is_file() and (path.suffix == ".png" or path.read_bytes() == made.read_bytes())
 
 
 def _open(root) -> Release:
@@ -249,12 +232,8 @@ def card_text(
         header=header(manifest, facts["steps"], table),
         arrays=_arrays(release),
         statistics=STATISTICS,
-        deviation=deviation,
-        compared=_compared(facts["subsets"]),
-        other_length=_of_other_length(facts["subsets"]),
-        far=[f"`{name}`" for name in far_subsets(facts["subsets"])],
-        levels=level_statistics(release),
-        level_episodes=STATISTICS_EPISODES,
+        successes={s.name: float(s.read("terminated").mean()) for s in release.subsets.values() if s.record.goal_mode},
+        state_episodes=STATISTICS_EPISODES,
         distractors=_distractors(manifest),
         has_mazes=any(record.goal_mode is not None for record in manifest.subsets),
         making=_making(release),
@@ -283,75 +262,37 @@ def _arrays(release: Release) -> dict[tuple, list[str]]:
     return kinds
 
 
-FAR = 0.25
-"""Standard deviations of the paper's episodes from which on a mean return is named as another one."""
+BACKGROUND = "background"
+"""The part of a distractor that is told by its number of videos."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 
 
-def deviation(subset: Mapping[str, Any]) -> float:
-    """The mean return of a subset less the paper's, in standard deviations of the paper's episodes."""
-    return (subset["returns"]["mean"] - subset["paper"]["mean"]) / subset["paper"]["std"]
-
-
-def far_subsets(subsets: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Names of the subsets of whole episodes whose mean return is another one than the paper's."""
-    return [subset["name"] for subset in _compared(subsets) if abs(deviation(subset)) > FAR]
-
-
-def _compared(subsets: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Subsets of episodes as long as the paper's, if it has them, too."""
-    return [subset for subset in subsets if subset["paper"] and not subset["other_length"]]
-
-
-def _of_other_length(subsets: Sequence[Mapping[str, Any]]) -> str:
-    """How many subsets have episodes of another length than the paper's, in words; "" if none."""
-    count = sum(bool(subset["paper"] and subset["other_length"]) for subset in subsets)
-    return "" if not count else "all subsets" if count == len(subsets) else pluralize(count, "subsets")
-
-
-def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, ...]]:
-    """Rows (setting, scale, camera, colors, background) of the table of distractors; none for mazes alone."""
+def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, str]]:
+    """Rows (setting, what varies and how much) of the table of distractors; none for mazes alone."""
     settings: dict[str, DistractorSetting] = {}
     for record in manifest.subsets:
         if record.goal_mode is None:
             settings.setdefault(record.setting, record.distractor)
-    rows: list[tuple[str, ...]] = []
-    for name, setting in settings.items():
-        if setting.kind == "none":
-            rows.append((name, "the model's own camera, colors and sky", "", "", ""))
-            continue
-        if setting.kind not in DISTRACTOR_KINDS:
-            words = "; ".join((d.__doc__ or d.__name__).splitlines()[0] for d in distractors_of(setting) if d.kinds)
-            rows.append((name, f"s = {setting.scale:g}; {words}", "", "", ""))
-            continue
-        s, moving = setting.scale_of("camera"), setting.kind == "dynamic"
-        low, high = 1 - camera.RADIUS_RANGE[0] * s, 1 + camera.RADIUS_RANGE[1] * s
-        place = (
-            f"angles and roll +-{np.degrees(camera.ANGLE_RANGE * s):.0f} degrees, distance x {low:.2f} to {high:.2f}"
-        )
-        if moving:
-            place += f"; speed walk std {camera.VELOCITY_STD * s:.3g}, at most {camera.MAX_SPEED * s:.3g} a tick"
-        tint = setting.scale_of("color")
-        paint = f"+-{tint:g} a channel" + (f"; walk std {color.STEP_STD * tint:.3g} a tick" if moving else "")
-        videos = "all videos" if setting.videos is None else f"up to {setting.videos} videos"
-        sky = f"{videos}; " + (f"a frame every {background.TICKS_A_FRAME} ticks" if moving else "one frame an episode")
-        shown = {"camera": place, "color": paint, "background": sky}
-        cells = [text if setting.varies(part) else "the model's own" for part, text in shown.items()]
-        if setting.varies(SHAKE):
-            cells[0] += f"; shaken, std {shake.SHARE * setting.scale_of(SHAKE):.3g} of its distance a frame"
-        if setting.varies(LIGHT):
-            most = ", ".join(f"{share:.3g}" for share in light.RANGE * setting.scale_of(LIGHT))
-            cells[1] += f"; lamps walk within +-{most} of their height along x, y, z"
-        if setting.varies(CUE):
-            cells[1] += f"; a shade of {cue.SHADE:g} by the last action's sign (correlation {setting.scale_of(CUE):g})"
-        rows.append((name, f"s = {setting.scale:g}", *cells))
-    return rows
+    return [(name, _varied(setting)) for name, setting in settings.items()]
+
+
+def _varied(setting: DistractorSetting) -> str:
+    """The parts of a distractor that vary, with their scales, in words."""
+    if setting.kind == "none":
+        return "the model's own camera, colors and sky"
+    if setting.kind not in DISTRACTOR_KINDS:
+        found = [d for d in distractors_of(setting) if d.kinds]
+        return f"s = {setting.scale:g}; " + "; ".join((d.__doc__ or d.__name__).splitlines()[0] for d in found)
+    videos = "all videos" if setting.videos is None else f"up to {setting.videos} videos"
+    words = {BACKGROUND: videos, CUE: f"correlation {setting.scale_of(CUE):g}"}
+    varied = [part for part in ALL_PARTS if setting.varies(part)]
+    return ", ".join(f"{part}: {words.get(part, f's = {setting.scale_of(part):g}')}" for part in varied)
 
 
 def _making(release: Release) -> list[str]:
     records, made_by = release.manifest.subsets, generator(release)
     if is_imported(release):
-        lines = [f"Imported by {made_by}; nothing was simulated or rendered again."]
+        lines = [f"Imported by {made_by}; nothing was simulated or rendered."]
     else:
         seeds = sorted({str(layer.makes["seed"]) for layer in release.layers.values() if "seed" in layer.makes})
         lines = [f"Made by {made_by} from the recipe in `recipes/` (seed {', '.join(seeds)})."]
@@ -380,7 +321,7 @@ def _policies(manifest: Manifest | Resolved) -> list[tuple[str, str, str]]:
 def _limits(release: Release) -> list[str]:
     manifest, limits = release.manifest, []
     if release.in_the_making or release.shortfalls:
-        limits.append("Not complete: only a part of the recipe's shards is here.")
+        limits.append("Not complete: only a part of the recipe's shards exists.")
     if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
     limits += _lacking_videos(release)
@@ -406,7 +347,7 @@ def _limits(release: Release) -> list[str]:
     seconds = {record.seconds_per_step for record in manifest.subsets}
     limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
     if is_imported(release):
-        limits.append("Imported data have no physics states and no labels: nothing of them can be made again.")
+        limits.append("Imported data have no physics states and no labels, so nothing can be rendered from them.")
     else:
         limits.append("Another processor or library version may change bits; `regenerate --check` says how far.")
     return limits
@@ -429,32 +370,22 @@ def _lacking_videos(release: Release) -> list[str]:
 
 
 def plot_returns(release: Release, path: Path) -> None:
-    """Box plots of episode returns as a PNG, a row a task and level, the paper's five numbers beneath each.
-
-    Fewer than `FEW_RETURNS` episodes are a mark each instead of a box.
-    """
+    """Box plots of episode returns as a PNG, a row a task and level, the paper's five numbers beneath each."""
     from matplotlib.figure import Figure
 
     groups: dict[tuple[str, str, bool], list[np.ndarray]] = {}
     for subset in release.subsets.values():
         groups.setdefault((subset.task, subset.level, subset.setting == FIXED), []).append(subset.returns)
     boxes: list[dict[str, Any]] = []
-    labels: list[str] = []
     shades: list[str] = []
-    marks: dict[int, np.ndarray] = {}
     for (task, level, fixed), values in groups.items():
-        returns = np.concatenate(values)
-        low, p25, median, p75, high = np.quantile(returns, (0, 0.25, 0.5, 0.75, 1))
-        if len(returns) < FEW_RETURNS:
-            marks[len(boxes)] = returns
-        boxes.append(dict(whislo=low, q1=p25, med=median, q3=p75, whishi=high, fliers=[]))
-        labels.append(f"{task} {level}" + (f" {FIXED}" if fixed else ""))
+        low, p25, median, p75, high = np.quantile(np.concatenate(values), (0, 0.25, 0.5, 0.75, 1))
+        label = f"{task} {level}" + (f" {FIXED}" if fixed else "")
+        boxes.append(dict(label=label, whislo=low, q1=p25, med=median, q3=p75, whishi=high, fliers=[]))
         shades.append("tab:blue")
-        paper = None if fixed else paper_returns(task, level)  # its goals are random
-        if paper:
+        if paper := None if fixed else paper_returns(task, level):  # fixed goals are others than the paper's
             keys = dict(whislo="min", q1="p25", med="median", q3="p75", whishi="max")
-            boxes.append({name: paper[key] for name, key in keys.items()} | {"fliers": []})
-            labels.append("DMC-VB paper")
+            boxes.append({name: paper[key] for name, key in keys.items()} | {"fliers": [], "label": "DMC-VB paper"})
             shades.append("lightgray")
     figure = Figure(figsize=(8, 0.6 + 0.3 * len(boxes)), layout="constrained")
     axes = figure.subplots()
@@ -462,11 +393,5 @@ def plot_returns(release: Release, path: Path) -> None:
     drawn = axes.bxp(boxes, positions=places, orientation="horizontal", patch_artist=True, widths=0.6)
     for patch, shade in zip(drawn["boxes"], shades, strict=True):
         patch.set_facecolor(shade)
-    for row, returns in marks.items():
-        whiskers = (*drawn["whiskers"][2 * row : 2 * row + 2], *drawn["caps"][2 * row : 2 * row + 2])
-        for part in (drawn["boxes"][row], drawn["medians"][row], *whiskers):
-            part.set_visible(False)
-        axes.plot(returns, np.full(len(returns), places[row]), "|", color="tab:blue", markersize=12, markeredgewidth=2)
-    axes.set_yticks(places, labels)
-    axes.set_xlabel("episode return (minimum, quartiles, maximum" + ("; few episodes: a mark each)" if marks else ")"))
+    axes.set_xlabel("episode return (minimum, quartiles, maximum)")
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})

@@ -62,7 +62,7 @@ def _subsets(a: Release, b: Release) -> Iterator[Difference]:
                 yield Difference(name, f"{field}: {_short(one)} and {_short(other)}")
         here = [len(release.subsets[name]) if name in release.subsets else 0 for release in (a, b)]
         if here[0] != here[1]:
-            yield Difference(name, f"episodes that are here: {here[0]} and {here[1]}")
+            yield Difference(name, f"local episodes: {here[0]} and {here[1]}")
 
 
 def _layers(a: Release, b: Release) -> Iterator[Difference]:

@@ -21,7 +21,6 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import CARD_FOLDER
 from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
 from dmcvb_gen.dataset.reader import Subset
-from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
 
@@ -151,8 +150,6 @@ def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
 def _picture(frame: np.ndarray | None) -> dict[str, Any] | None:
     if frame is None:
         return None
-    if frame.ndim != 3 or frame.shape[-1] != 3:
-        raise StoreError(f"a first frame has shape {frame.shape}, which is no picture")
     picture, buffer = Image.fromarray(frame), io.BytesIO()
     if max(picture.size) > FRAME:
         picture = picture.resize((FRAME, FRAME), Image.Resampling.BOX)

@@ -4,19 +4,19 @@ Inputs and recipes come first, then each shard with its record last, the lists, 
 that the files of its shard are, so nothing is read twice. A part of a release is a copy: copy.json says of what.
 """
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.dataset.gate import Release, Shard
 from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, FileRecord, Manifest
 from dmcvb_gen.dataset.writer import finish_copy, wrong_bytes
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
+from dmcvb_gen.options import Count, GoalPictures, Local, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
 from dmcvb_gen.release.tree import (
     attachments,
@@ -29,7 +29,10 @@ from dmcvb_gen.release.tree import (
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path, shown
 from dmcvb_gen.storage.store import Store, open_store
-from dmcvb_gen.text import format_bytes, quoted
+from dmcvb_gen.text import as_names, format_bytes, quoted
+
+if TYPE_CHECKING:
+    from dmcvb_gen.generate.paint import RenderResult
 
 
 @dataclass(frozen=True)
@@ -41,31 +44,69 @@ class Moved:
     moved: int
 
 
+@checked
 def fetch(
     url: str,
-    out: str | Path,
-    only: Sequence[str] = (),
-    episodes: tuple[int, int] | None = None,
+    out: Local,
+    only: Names = (),
+    episode_range: Span | None = None,
     *,
-    options: dict[str, Any] | None = None,
-    workers: int = 8,
-    tick: ProgressCallback = ignore,
-) -> Moved:
-    """Download a release, or the shards of it that hold some episodes; another call resumes or adds.
+    paint: bool = False,
+    size: Count | None = None,
+    views: Names | None = None,
+    goal: GoalPictures | None = None,
+    storage_options: dict[str, Any] | None = None,
+    workers: Count = 8,
+    progress: bool = True,
+) -> ReleaseReader:
+    """Download a published release, or a part of it, and open it.
 
     Args:
-      url: its URL, or "<URL>@sha256:<digest>".
-      out: its folder here.
-      only, episodes: subset patterns and (first, last + 1); all by default.
-      options: options of the storage client.
-      workers: files at a time.
-      tick: called with the bytes of each file.
+      url (URL): Where it was published, or "<URL>@sha256:<digest>".
+      out (FOLDER): Local folder for the release.
+      only (PATTERN): Fetch only these subsets.
+      episode_range (RANGE): Use only the shards with episodes A to B - 1.
+      paint: Then render the images.
+      size: Width and height in pixels. [default: the manifest's]
+      views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
+      goal: Mazes: render only images with, or without, the goal. [default: both]
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
+      workers: Parallel transfers.
 
     Raises:
       StoreError: no release is there, or it is `out` itself; a file is not what its digest says; `out` holds something
         else; there is no room; access is refused.
     """
-    source, folder = Release.open(url, options), local_path(out)
+    download(locals())
+    return open_for_reading(str(out))
+
+
+def download(given: Mapping[str, Any], notify: Callable[[str], None] = ignore) -> tuple[Moved, "RenderResult | None"]:
+    """Do what the arguments of `fetch` ask for: what was moved and, with `paint`, what was rendered."""
+    look = {name: given[name] for name in ("size", "views", "goal")}
+    if not given["paint"] and any(look.values()):
+        raise DmcvbError("--size, --views and --goal have no effect without --paint: add it (in Python, paint=True)")
+    only, episodes = as_names(given["only"]), given["episode_range"]
+    with progress_bar(given["progress"], "B") as bar:
+        source = Release.open(given["url"], given["storage_options"])
+        moved = _fetch(source, given["url"], local_path(given["out"]), only, episodes, given["workers"], bar)
+    if not given["paint"]:
+        return moved, None
+    from dmcvb_gen.making import paint  # here, as it needs a simulator
+
+    chosen = dict(only=only, episode_range=episodes, progress=given["progress"])
+    return moved, paint(given["out"], **chosen, **look, notify=notify)
+
+
+def _fetch(
+    source: Release,
+    url: str,
+    folder: Path,
+    only: Sequence[str],
+    episodes: tuple[int, int] | None,
+    workers: int,
+    tick: ProgressCallback,
+) -> Moved:
     if source.in_the_making:
         raise StoreError(f"{source.place} is not finished; finish it first: dmcvb-gen rollout --out {source.place}")
     if source.store.folder and source.store.folder.resolve() == folder.resolve():
@@ -118,7 +159,7 @@ def _check_target(target: Store, source: Release) -> bool:
     recipes = {f"{RECIPES}{recipe.sha256}.json" for recipe in source.recipes}
     inputs = {file.path for file in source.manifest.inputs}  # they come first
     if there and not recipes & {*there} and {*there} - inputs:
-        raise StoreError(f"{target.place} is not empty and holds no release; choose an empty or new folder for --out")
+        raise StoreError(f"{target.place} is not empty and holds no release; choose an empty destination for --out")
     if strange := {path for path in there if path.startswith(RECIPES)} - recipes:
         raise StoreError(f"{target.place} holds another release ({min(strange)}); choose another --out")
     return False

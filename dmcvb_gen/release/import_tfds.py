@@ -299,7 +299,7 @@ def _refuse_missing(path: Path) -> None:
             first = next(number for number in range(count) if number not in numbers)
             raise StoreError(
                 f"{path} holds {len(numbers)} of {count} files (number {first} is missing); fetch the others, or "
-                "import what is there with --partial"
+                "import the others with --partial"
             )
 
 

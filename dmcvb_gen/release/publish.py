@@ -3,8 +3,6 @@
 Two publishers of one release create equal files; of two releases, the manifest of the one that is slower is refused.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,7 +12,8 @@ from dmcvb_gen.dataset.gate import Release, Shard
 from dmcvb_gen.dataset.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json, is_attachment
 from dmcvb_gen.dataset.writer import copy_of, plain_metadata, wrong_bytes
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.options import Count, Location, checked, progress_bar, refuse
+from dmcvb_gen.parallel import ProgressCallback, expect
 from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.release.tree import attachments, described_files, grows_from, list_files, manifest_text, shard_files
@@ -22,60 +21,41 @@ from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import quoted
 
 
-def publish_folder(
-    path: str | Path,
-    url: str,
-    *,
-    pixels: bool = True,
-    repair: bool = False,
-    options: dict[str, Any] | None = None,
-    workers: int = 8,
-    tick: ProgressCallback = ignore,
-) -> Moved:
-    """Put a complete release, or an export, at a URL; run again after an interruption, it resumes.
-
-    Args:
-      url: s3://bucket/name, gs://, az://, hf://datasets/owner/name or file:.
-      pixels: False leaves the images out; `paint` renders them again.
-      repair: see `publish`.
-      options: options of the storage client; credentials belong in the environment.
-      workers: parallel transfers.
-      tick: called with 1 for each file.
-
-    Raises:
-      StoreError: as `publish` does, or an option of releases was given for an export.
-    """
-    if not (Path(path) / MANIFEST).exists() and export_format(path) is not None:
-        if not pixels or repair:
-            raise StoreError("--no-pixels and --repair are for releases, and this is an export: remove them")
-        return publish_export(path, url, options=options, workers=workers, tick=tick)
-    return publish(path, url, pixels=pixels, repair=repair, options=options, workers=workers, tick=tick)
-
-
+@checked
 def publish(
-    root: str | Path,
+    release: Location,
     url: str,
     *,
-    pixels: bool = True,
+    storage_options: dict[str, Any] | None = None,
     repair: bool = False,
-    options: dict[str, Any] | None = None,
-    workers: int = 8,
-    tick: ProgressCallback = ignore,
+    workers: Count = 8,
+    pixels: bool = True,
+    progress: bool = True,
 ) -> Moved:
-    """Put a complete release at a URL; run again after an interruption, it resumes.
+    """Put a complete release, or an export, at a URL: every file checked, the manifest last.
 
     Args:
-      url: s3://bucket/name, gs://, az://, hf://datasets/owner/name or file:; it becomes the release's folder.
-      pixels: False leaves images out that can be rendered again; what is there then is a copy, with the same digest.
-      repair: compare published files by their digests, not by their sizes, and replace those that differ.
-      options: options of the storage client; credentials belong in the environment.
-      workers: parallel transfers.
-      tick: called with 1 for each file.
+      release (RELEASE): Folder of the release, or of an export.
+      url (URL): Where to put it: s3://, gs://, az://, hf:// or file:.
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
+      repair: Compare published files by their digests, and replace those that differ.
+      workers: Parallel transfers.
+      pixels: False: Publish without images; `paint` renders them again.
 
     Raises:
       StoreError: the release is not complete or damaged; another version is there; access is refused; a file could not
         be moved.
     """
+    with progress_bar(progress, " files", scaled=False) as bar:
+        if not (Path(release) / MANIFEST).exists() and export_format(release) is not None:
+            refuse("it is for releases, and this is an export", **{"no-pixels": not pixels, "repair": repair})
+            return publish_export(release, url, options=storage_options, workers=workers, tick=bar)
+        return _publish_release(release, open_store(url, storage_options), pixels, repair, workers, bar)
+
+
+def _publish_release(
+    root: str | Path, store: Store, pixels: bool, repair: bool, workers: int, tick: ProgressCallback
+) -> Moved:
     release = Release.open(root)
     _check_complete(release, root, pixels)
     shards = list(release.shards(images=pixels))
@@ -83,7 +63,6 @@ def publish(
     texts = attachments(release.store)
     if light.copy:
         texts[COPY] = canonical_json(light.copy)
-    store = open_store(url, options)
     store.begin()
     tag = store.version(MANIFEST)
     there = None if tag is None else _published(store, release)

@@ -4,8 +4,6 @@ The manifest names lists, lists name files; each is compared with its SHA-256 wh
 a folder, values are checked everywhere, a sample of steps is simulated and a sample of frames rendered.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,9 +29,11 @@ from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.writer import plain_metadata, wrong_bytes
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.files import sha256_bytes
-from dmcvb_gen.parallel import Pool, ProgressCallback, Workers, expect, ignore, in_order, open_pool
+from dmcvb_gen.options import Location, checked, progress_bar, refuse
+from dmcvb_gen.parallel import Pool, ProgressCallback, Ray, Workers, expect, ignore, in_order, open_pool
 from dmcvb_gen.release.issue import NOT_PART, UNCHECKED, Issue
 from dmcvb_gen.release.tree import Listed, described_files, layer_files, list_files
+from dmcvb_gen.storage.places import is_url
 
 SAMPLE_FILES = 40
 """Files of a URL that are read if not all are asked for; spread evenly over the release."""
@@ -82,7 +82,39 @@ class Verification:
         return self.finished and not self.incomplete and not self.unchecked
 
 
+@checked
 def verify(
+    release: Location,
+    *,
+    everything: bool = False,
+    backgrounds: Location | None = None,
+    workers: Workers | None = None,
+    storage_options: dict[str, Any] | None = None,
+    progress: bool = True,
+) -> Verification:
+    """Check a release: all of a folder; at a URL the manifest, its lists and a sample of files.
+
+    Args:
+      release (RELEASE|URL): Folder or URL of the release.
+      everything: At a URL: read every file instead of a sample.
+      backgrounds (FOLDER): Folder of the background videos, if it has moved.
+      workers: Worker processes; at a URL: parallel downloads. [default: 1, at a URL 8]
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
+
+    Raises:
+      DmcvbError: there is no release, nothing is committed, or an option has no effect there.
+    """
+    if is_url(str(release)):
+        threads = THREADS if workers is None else workers
+        refuse("at a URL nothing is rendered or simulated", backgrounds=backgrounds, executor=isinstance(threads, Ray))
+        with progress_bar(progress, " files", scaled=False) as bar:
+            return verify_url(str(release), storage_options, everything, bar, threads)  # type: ignore[arg-type]
+    refuse(f"{release} is a folder, which is always read whole", all=everything, option=storage_options)
+    with progress_bar(progress, " checks", scaled=False) as bar:
+        return verify_folder(release, None if backgrounds is None else str(backgrounds), bar, workers or 1)
+
+
+def verify_folder(
     place: str | Path,
     backgrounds: str | None = None,
     tick: ProgressCallback = ignore,
@@ -102,16 +134,13 @@ def verify(
     """
     if not isinstance(workers, Pool):
         with open_pool(workers, tick=tick) as pool:
-            return verify(place, backgrounds, tick, pool, names)
+            return verify_folder(place, backgrounds, tick, pool, names)
     release = Release.open(place)
     files, findings = _expected(release)
     expect(tick, len(files) + len(release.manifest.subsets))
     findings += [*_wrong(release, files, tick), *_strange(release, files)]
-    damaged = {finding.subset for finding in findings}
-    sound = {
-        record.name: Subset(release, record) for record in release.manifest.subsets if not damaged & {*record.layers}
-    }
-    chosen = [subset for name, subset in sound.items() if len(subset) and (names is None or name in names)]
+    sound = _sound(release, findings)
+    chosen = [subset for subset in sound if len(subset) and (names is None or subset.name in names)]
     if not chosen and not findings:
         raise DmcvbError(f"{place} has no episodes yet; run the rollout first")
     for found in in_order(_check_subset, [(subset, backgrounds) for subset in chosen], workers, tick):
@@ -148,25 +177,25 @@ def verify_url(
     findings += _wrong(release, sample, tick, workers)
     if not everything:
         findings += _wrong_sizes(release, [file for file in files if file not in sample])
+    sound = _sound(release, findings)
+    return _verification(release, [subset for subset in sound if len(subset)], findings, len(sample), sound)
+
+
+def _sound(release: Release, findings: Sequence[Issue]) -> list[Subset]:
+    """The subsets whose layers have no finding."""
     damaged = {finding.subset for finding in findings}
-    sound = {
-        record.name: Subset(release, record) for record in release.manifest.subsets if not damaged & {*record.layers}
-    }
-    return _verification(release, [each for each in sound.values() if len(each)], findings, len(sample), sound)
+    return [Subset(release, record) for record in release.manifest.subsets if not damaged & {*record.layers}]
 
 
 def _verification(
-    release: Release, chosen: Sequence[Subset], findings: list[Issue], files: int, sound: dict[str, Subset]
+    release: Release, chosen: Sequence[Subset], findings: list[Issue], files: int, sound: Sequence[Subset]
 ) -> Verification:
     counts = {"subsets": len(chosen), "episodes": 0, "steps": 0, "files": files}
     for subset in chosen:
         counts["episodes"] += len(subset)
         counts["steps"] += subset.steps
-    incomplete = {
-        name: (len(subset), subset.record.episodes)
-        for name, subset in sound.items()
-        if len(subset) < subset.record.episodes
-    }
+    lacking = [subset for subset in sound if len(subset) < subset.record.episodes]
+    incomplete = {subset.name: (len(subset), subset.record.episodes) for subset in lacking}
     unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
     faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
     return Verification(counts, faults, incomplete, release.digest, release.compared, unchecked)

@@ -160,7 +160,7 @@ def _page(release: Release, parts: list[dict[str, Any]]) -> bytes:
 
 def _command(release: Release, path: str, subset: SubsetReader, index: int) -> str:
     """The command that makes an episode's shard again, or fetches it from a URL; "" if nothing can make it."""
-    what = f"--only {shlex.quote(subset.name)} --range {index}:{index + 1} --out again"
+    what = f"--only {shlex.quote(subset.name)} --range {index}:{index + 1} --out regenerated"
     if is_url(path):
         return f"dmcvb-gen fetch {shlex.quote(shown_place(path))} {what}"
     if subset.record.imported:

@@ -153,6 +153,13 @@ class HubStore(Store):
                 tick(len(batch))
         return [path for path in paths if path in there]
 
+    def _delete(self, path: str) -> None:
+        from huggingface_hub import CommitOperationDelete
+
+        if path in self._known([path], self._head()):
+            gone = [CommitOperationDelete(self.folder_there + path)]
+            self._made(self._api.create_commit(**self._where, operations=gone, commit_message=f"remove damaged {path}"))
+
     def finish(self, contents: Mapping[str, bytes], expected: str | None = ANY) -> bool:
         """In one commit, which the Hub refuses if another one has come since the version was compared."""
         from huggingface_hub import CommitOperationAdd

@@ -19,7 +19,6 @@ from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.generate.recipe import load_recipe
 from dmcvb_gen.policies.bundled import bundled_policies
-from dmcvb_gen.release.card import write_card
 
 NAME = "walker-walk/random/none"
 TINY = ["--max-steps", "4", "--size", "16", "--episodes", "2"]
@@ -95,7 +94,6 @@ def test_a_field_that_is_given_twice_is_told_with_its_line(tmp_path):
 
 @pytest.mark.parametrize("words, told", [
     (["walker-walk", "--level", "expert,medium"], "unknown level 'expert,medium'"),
-    (["walker-walk", "--goal", "hidden"], "walker-walk has no goal hidden; --goal is for mazes"),
     (["foo.txt"], "cannot read layout foo.txt"),
     (["walker-walk", "--level", "expert", "--behaviour", "mine.py"], "give --behaviour mine:FUNCTION"),
     (["walker-walk", "--level", "expert", "--behaviour", "mine.py:swing"], "give --behaviour mine:swing"),
@@ -183,25 +181,6 @@ def test_a_manifest_is_always_compared_so_check_is_refused_at_once(small_release
 
 def test_a_missing_pyarrow_names_the_extra_of_cards_first():
     assert "the extra [hf] or [lerobot]" in install_hint("pyarrow")
-
-
-# -- cards ----------------------------------------------------------------------------------------
-
-
-def test_a_card_of_cut_episodes_does_not_compare_them(tmp_path):
-    out = tmp_path / "a"
-    run("rollout", "walker-walk", "--level", "random", *TINY, "--out", out)
-    run("rollout", "walker-walk", "--level", "random", "--distractor", "static", *TINY, "--out", out)
-    write_card(out)
-    text = " ".join((out / "README.md").read_text().split())
-    assert "Episodes of all subsets have another length than the paper's, so their returns cannot be compared." in text
-    assert "z is" not in text and "z =" not in text and "All subsets have fewer steps" in text
-    assert "fits the release" in run("card", out, "--check")
-
-
-def test_a_card_names_the_subset_that_its_statistics_are_of(small_mazes, tmp_path):
-    write_card(small_mazes, tmp_path)
-    assert "| `ant-maze-tiny/random/visible` | 2 |" in (tmp_path / "README.md").read_text()
 
 
 # -- policies and scores --------------------------------------------------------------------------

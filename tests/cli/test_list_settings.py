@@ -37,9 +37,3 @@ def test_values_are_the_tasks_and_those_given():
 def test_a_maze_of_ones_own_is_learned_by_guided(tmp_path):
     (tmp_path / "ring.txt").write_text("****\n*  *\n****\n")
     assert "half_life=12500" in ask("--layout", str(tmp_path / "ring.txt")).stdout
-
-
-def test_what_has_no_effect_is_refused_and_nothing_is_written(tmp_path):
-    done = ask("walker-walk", "--out", str(tmp_path / "run"), "--steps", "5")
-    assert done.exit_code and "--out has no effect: --list-settings trains nothing" in str(done.output)
-    assert not list(tmp_path.iterdir())

@@ -79,6 +79,6 @@ def test_checks_alone_name_no_profile(release, tmp_path):
 
 def test_a_url_without_a_bucket_is_one_line(release, tmp_path):
     url = "s3://"
-    for words in (["publish", release, url], ["fetch", url, "--out", tmp_path / "x"], ["list", "--remote", url]):
+    for words in (["publish", release, url], ["fetch", url, "--out", tmp_path / "x"], ["info", url]):
         said = run(*words, code=2)
         assert said == f"error: {url} names no bucket; give {url}BUCKET/NAME\n"

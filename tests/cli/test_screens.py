@@ -10,6 +10,8 @@ from dmcvb_gen.cli import COMMANDS, GROUPS, main
 from dmcvb_gen.cli.common import GroupedCommand, print_table
 from tests.conftest import TINY_MAZE
 
+PARTS = ("begin", "part", "finish", "slurm")
+
 
 def screen(arguments, columns=80):
     """The lines that a command prints on a terminal of some columns."""
@@ -59,6 +61,14 @@ def test_every_command_is_in_one_group_of_the_help():
     assert all(f"{heading}:" in text for heading in GROUPS)
     assert all(f"  {name} " in text for name in COMMANDS)
     assert sum(map(len, GROUPS.values())) == len(COMMANDS)
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), *(["cluster", name] for name in PARTS)])
+def test_help_fits_80_columns_and_has_an_example(command):
+    lines = screen([*command, "--help"])
+    assert not [line for line in lines if len(line) > 80]
+    if len(command) == 1 and command != ["list"]:
+        assert any(line.strip().startswith(f"dmcvb-gen {command[0]}") for line in lines)
 
 
 def test_the_options_of_rollout_have_headings():

@@ -60,7 +60,7 @@ def test_painting_a_light_release_gives_the_records_of_a_painted_one(made, light
     images = [layer for layer in Release.open(made / "painted").layers.values() if layer.kind == "images"]
     assert told["shards"] == 2 * len(images) and told["known"] == 0 and told["complete"]
     assert records(Release.open(light)) == records(Release.open(made / "painted"))
-    assert "every shard that is here has its images already" in invoke("paint", light).output
+    assert "All local shards have images already" in invoke("paint", light).output
 
 
 @pytest.mark.slow_cases("maze")

@@ -103,9 +103,9 @@ def test_a_difference_is_said_with_how_far_and_what_differs_in_the_environment(c
     change_actions(copy)
     result = invoke("regenerate", copy, "--only", NAME, "--range", "0:1", "--check")
     assert result.exit_code == 1
-    assert "trajectories shard 0 (episodes 0:2): made again, other bytes; action: max" in result.output
+    assert "trajectories shard 0 (episodes 0:2): MISMATCH: digest differs; action: max" in result.output
     assert "pixels: max 3, mean" in result.output and "state: max" not in result.output
-    assert "environment: cpu was Another 9000, is" in result.output
+    assert "environment: cpu was Another 9000 and is" in result.output
 
 
 def test_a_file_that_comes_out_otherwise_is_not_put_in(copy):
@@ -164,9 +164,9 @@ def test_videos_and_policies_that_are_lost_are_put_back(tmp_path):
     policy.write_bytes(policy.read_bytes()[:20])
     command = ["regenerate", str(tmp_path / "r"), "--backgrounds", str(tmp_path / "videos")]
     result = invoke(*command)
-    assert result.exit_code == 0 and "3 other files put back" in result.output, result.output
+    assert result.exit_code == 0 and "restored 3 other files" in result.output, result.output
     assert files_of(tmp_path / "r") == before
-    assert "nothing is damaged" in invoke(*command).output
+    assert "no shard is damaged" in invoke(*command).output
 
 
 @pytest.mark.parametrize("arguments, cure", [

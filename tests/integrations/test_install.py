@@ -119,7 +119,7 @@ def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
         ["verify", release],
         ["publish", release, f"file:{tmp_path / 'published'}"],
         ["fetch", f"file:{tmp_path / 'published'}", "--out", tmp_path / "fetched"],
-        ["list", "--remote", f"file:{tmp_path / 'published'}"],
+        ["info", f"file:{tmp_path / 'published'}"],
         ["export", release, "--to", "hdf5", "--out", tmp_path / "h5"],
     ):
         done = run(site, *command)

@@ -41,18 +41,10 @@ def test_minari_lists_what_was_exported(datasets):
     assert "dmcvb-gen" in about["dmcvb_gen"] and len(set(about.values())) == len(spaces)
 
 
-def test_episodes_have_the_pictures_that_the_subset_is_about(datasets, stored):
+def test_an_episode_is_terminated_or_truncated_as_it_was(datasets, stored):
     for name, dataset_id in datasets.items():
-        dataset = minari.load_dataset(dataset_id)
-        for index, episode in enumerate(dataset.iterate_episodes()):
-            length, values, terminated = stored[name].episode(index)
-            pixels = np.moveaxis(values["pixels"], 1, 3)
-            expected = pixels.reshape(*pixels.shape[:3], -1)
-            np.testing.assert_array_equal(episode.observations["pixels"], expected)
-            np.testing.assert_array_equal(episode.observations["state"], values["state"])
-            np.testing.assert_array_equal(episode.actions, values["action"])
-            np.testing.assert_array_equal(episode.rewards, values["reward"])
-            assert len(episode.actions) == length and episode.terminations[-1] == terminated != episode.truncations[-1]
+        for index, episode in enumerate(minari.load_dataset(dataset_id).iterate_episodes()):
+            assert episode.terminations[-1] == stored[name].episode(index)[2] != episode.truncations[-1]
 
 
 def test_environments_are_recovered_with_the_spaces_of_the_data(datasets, stored):

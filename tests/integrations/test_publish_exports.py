@@ -37,13 +37,13 @@ def test_an_export_arrives_whole_and_is_mixed_with_nothing(to, stored, tmp_path)
     data = next(path for path in map(Path, content(folder)) if path.suffix and not path.name.startswith("."))
     left = f"left-by-another{data.suffix}"
     (there / left).write_bytes(b"of a larger export")
-    with pytest.raises(StoreError, match=f"{left}.*give another URL"):
+    with pytest.raises(StoreError, match=f"{left}.*choose another URL"):
         publish_export(folder, f"file://{there}")
     release = shutil.copytree(stored[name].folder, tmp_path / "release")
     with pytest.raises(StoreError, match="holds a release.*give another URL"):
         publish_export(folder, f"file://{release}")
     refused = CliRunner().invoke(main, ["publish", str(folder), f"file://{tmp_path / 'x'}", "--no-pixels"])
-    assert refused.exit_code == 2 and "are for releases" in refused.output
+    assert refused.exit_code == 2 and "it is for releases, and this is an export" in refused.output
 
 
 def test_the_hub_gets_lerobots_tag(stored, tmp_path, monkeypatch):
@@ -77,7 +77,7 @@ def test_an_export_goes_to_an_empty_folder_and_replaces_nothing(stored, tmp_path
         place.mkdir(parents=True)
         assert export(str(stored[SUBSETS[0]].folder), to, out, [SUBSETS[0]], merge=merge) == [place]
     (place / ".dmcvb-gen.json").write_text("{}")
-    with pytest.raises(StoreError, match="is there already"):
+    with pytest.raises(StoreError, match="holds something else"):
         export(str(stored[SUBSETS[0]].folder), to, out, [SUBSETS[0]])
 
 

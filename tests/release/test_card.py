@@ -55,12 +55,9 @@ def test_the_numbers_are_the_datas_and_the_papers(carded):
         row = next(line for line in text.split("## Returns")[1].splitlines() if f"`{subset.name}`" in line)
         assert f"| {subset.returns.mean():.1f} | {subset.returns.std():.1f} |" in row
     paper = paper_returns("walker-walk", "random")
-    far = []
     for subset in Release.open(carded).subsets.values():
         z = (subset.returns.mean() - paper["mean"]) / paper["std"]
         assert f"| DMC-VB paper (z = {z:+.2f}) | {paper['mean']:.1f} | {paper['std']:.1f} |" in text
-        far += [f"`{subset.name}`"] if abs(z) > 0.25 else []
-    assert far and f"Off by more than a quarter of a standard deviation: {', '.join(far)}." in text
     assert "s = 0.2" in text and "uniform random actions" in text and "Known limits" in text
     assert "regenerate small --check" in text and "@inproceedings{ortiz2024dmcvb" in text
 
@@ -137,7 +134,7 @@ def test_a_fitting_card_passes_and_a_lying_one_is_found(copy):
     assert check_card(copy) == []
     readme = copy / "README.md"
     readme.write_text(readme.read_text().replace("1,500", "9,999", 1))
-    assert check_card(copy) == ["README.md does not fit the release"]
+    assert check_card(copy) == ["README.md does not match the release"]
     write_card(copy)
     roll_out(small_recipe(version="1.0.1"), copy)  # the same episodes, and another version
     (copy / "card/contact_sheet.png").unlink()
@@ -145,7 +142,7 @@ def test_a_fitting_card_passes_and_a_lying_one_is_found(copy):
     Image.new("RGB", (4, 4)).save(copy / "card/returns.png")  # which other versions of matplotlib draw differently
     result = CliRunner().invoke(main, ["card", str(copy), "--check"])
     lies = ("README.md", "croissant.json", "card/episodes.parquet")  # of this version they say nothing
-    said = {*(f"{name} does not fit the release" for name in lies), "card/contact_sheet.png is missing"}
+    said = {*(f"{name} does not match the release" for name in lies), "card/contact_sheet.png is missing"}
     assert result.exit_code == 1 and set(result.output.splitlines()) == said
 
 
@@ -178,11 +175,11 @@ def test_a_terminal_gets_no_commands_of_its_own(capsys):
 def test_the_card_of_a_part_is_compared_by_its_rows(carded, tmp_path):
     fetch(f"file:{carded}", tmp_path / "part", ["*/none"], (0, 1))
     result = CliRunner().invoke(main, ["card", str(tmp_path / "part"), "--check"])
-    assert result.exit_code == 3 and "the card fits the episodes that are here; 7 are not" in result.output
+    assert result.exit_code == 0 and "the card matches the data" in result.output
     table = pq.read_table(carded / "card/episodes.parquet")
     pq.write_table(table.slice(0, 0), tmp_path / "part/card/episodes.parquet")
     result = CliRunner().invoke(main, ["card", str(tmp_path / "part"), "--check"])
-    assert result.exit_code == 1 and "episodes.parquet does not fit the episodes that are here" in result.output
+    assert result.exit_code == 1 and "episodes.parquet does not match the local episodes" in result.output
 
 
 def test_longer_episodes_are_not_compared_with_the_papers(tmp_path):
@@ -190,7 +187,7 @@ def test_longer_episodes_are_not_compared_with_the_papers(tmp_path):
     roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "r")
     write_card(tmp_path / "r")
     text = " ".join((tmp_path / "r/README.md").read_text().split())
-    assert "Episodes of all subsets have another length than the paper's" in text and "z = " not in text
+    assert "| DMC-VB paper |" in text and "(z = " not in text
 
 
 def test_a_readme_that_is_no_card_is_not_replaced(carded, tmp_path):

@@ -14,15 +14,15 @@ from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.release import fetch as fetching
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
-from dmcvb_gen.release.verify import check_files, verify_url
+from dmcvb_gen.release.verify import check_files, verify
 from dmcvb_gen.storage.store import Store, open_store
 from tests.dataset.made_up import make, recipe
 from tests.fake_hub import fake_hub
 
 
-def content(place, options=None):
+def content(place, storage_options=None):
     """Path -> bytes of all files at a place."""
-    store = open_store(place, options)
+    store = open_store(place, storage_options)
     return {path: store.read(path, size) for path, size in store.list().items()}
 
 
@@ -49,7 +49,7 @@ def server():
 def place(request, tmp_path, monkeypatch):
     """A place to publish to, with its options."""
     if request.param == "bucket":
-        return f"s3://copies/{tmp_path.name}", {"options": request.getfixturevalue("server")}
+        return f"s3://copies/{tmp_path.name}", {"storage_options": request.getfixturevalue("server")}
     if request.param == "hub":
         fake_hub(tmp_path / "hub", monkeypatch)
         return "hf://datasets/me/tiny", {}
@@ -61,10 +61,13 @@ def test_a_release_comes_back_as_it_went(made, place, tmp_path):
     (made / "LICENSE").write_text("mine")
     assert publish(made, url, **options).moved and publish(made, url, **options).moved == 0
     assert content(url, **options) == content(made)
-    assert fetch(url, back, **options).moved and fetch(url, back, **options).moved == 0
+    fetch(url, back, **options)
+    chunks = {path: path.stat().st_ino for path in back.rglob("c/*")}
+    fetch(url, back, **options)
+    assert chunks and chunks == {path: path.stat().st_ino for path in back.rglob("c/*")}
     assert content(back) == content(made) and not check_files(back)
     digest = Release.open(made).digest
-    found = verify_url(f"{url}@sha256:{digest}", everything=True, **options)
+    found = verify(f"{url}@sha256:{digest}", everything=True, **options)
     assert found.sound and found.complete and found.compared and found.digest == digest
     with pytest.raises(StoreError, match=f"is release {digest}, not 0000"):
         fetch(f"{url}@sha256:{'0' * 64}", tmp_path / "x", **options)
@@ -90,7 +93,7 @@ def test_without_images_it_is_a_copy_of_the_same_digest(made, place, tmp_path):
     fetch(url, back, **options)
     light = Release.open(back)
     assert light.digest == Release.open(made).digest and light["hop/random/none"].unpainted.all()
-    assert not check_files(back) and verify_url(url, **options).sound and not light.shortfalls
+    assert not check_files(back) and verify(url, **options).sound and not light.shortfalls
     assert publish(back, f"file:{tmp_path / 'x'}", pixels=False).moved
 
 
@@ -153,20 +156,22 @@ def test_no_wrong_byte_is_taken(made, tmp_path):
     assert not check_files(made)
 
 
-def test_what_was_damaged_or_lost_there_is_found_and_replaced(made, tmp_path):
-    there = tmp_path / "there"
-    url, before = f"file:{there}", content(made)
+@pytest.mark.parametrize("hub", [False, True], ids=["folder", "hub"])
+def test_what_was_damaged_or_lost_there_is_found_and_replaced(made, tmp_path, monkeypatch, hub):
+    there = fake_hub(tmp_path / "hub", monkeypatch).folder if hub else tmp_path / "there"
+    url, before = "hf://datasets/me/tiny" if hub else f"file:{there}", content(made)
     publish(made, url)
     wrong, short, lost = (f"hop/random.zarr/none/pixels/c/{number}/0/0/0/0" for number in range(3))
     (there / wrong).write_bytes(before[wrong][:-1] + b"x")
     (there / short).write_bytes(b"half")
     (there / lost).unlink()
-    found = [str(issue) for issue in verify_url(url).findings]
+    found = [str(issue) for issue in verify(url).findings]
     assert sum(short in text or lost in text for text in found) == 2
-    assert any(wrong in str(issue) for issue in verify_url(url, everything=True).findings)
+    assert any(wrong in str(issue) for issue in verify(url, everything=True).findings)
     with pytest.raises(StoreError, match="has 4 bytes instead of .*--repair"):
         publish(made, url)
     assert publish(made, url, repair=True).moved == 3 and content(there) == before
+    assert verify(url, everything=True).sound
 
 
 def test_no_room_is_said_before_anything_comes(made, tmp_path, monkeypatch):

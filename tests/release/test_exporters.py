@@ -9,17 +9,18 @@ import shutil
 import subprocess
 import sys
 import types
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 import zarr
 from click.testing import CliRunner
 from PIL import Image
 
 import dmcvb_gen
 from dmcvb_gen.cli import main
-from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.release.export import STAMP, export, registry
 from dmcvb_gen.release.export.publishing import export_format
@@ -29,43 +30,63 @@ from dmcvb_gen.release.tfrecord import offsets, read_example
 SUBSETS = {"small_release": "walker-walk/random/static", "small_mazes": "ant-maze-tiny/random/hidden"}
 
 
-def decoded(pictures):
-    return np.stack([np.asarray(Image.open(io.BytesIO(picture))) for picture in pictures])
+VIEWS = ("top", "egocentric", "follow", "overhead")
+"""Of mazes, in the order in which policies see them (SPEC, section 3)."""
 
 
-# -- readers: what the program that a format is for finds of episode 0: actions, rewards, images of the first view --
+def in_order(names):
+    """Names of images in the order of their views; the one name of a task with one view."""
+    names = list(names)
+    ordered = [name for view in VIEWS for name in names if view in name]
+    return ordered or names
+
+
+def stacked(images):
+    """Images of each view as the channels of one array; decoded if they are files."""
+    views = [[np.asarray(Image.open(io.BytesIO(i))) if isinstance(i, bytes) else i for i in view] for view in images]
+    return np.concatenate([np.stack(view) for view in views], axis=-1)
+
+
+# -- readers: what the program that a format is for finds of episode 0: actions, rewards, images of all views --
 
 
 def read_hdf5(folder):
     h5py = pytest.importorskip("h5py")
     with h5py.File(folder / "data_000.hdf5") as file:
-        images = file["observation"][:].transpose(0, 2, 3, 1)
-        return file["action"][1:], file["reward"][1:], images[..., :3]
+        return file["action"][1:], file["reward"][1:], file["observation"][:].transpose(0, 2, 3, 1)
 
 
 def read_npz(folder):
     [path] = folder.glob("*.npz")
     with np.load(path) as data:
-        return data["action"][1:], data["reward"][1:], data["image"][..., :3]
+        return data["action"][1:], data["reward"][1:], data["image"]
+
+
+def read_zarr(folder):
+    data = zarr.open_group(str(folder / "data.zarr"), mode="r")
+    [length] = data["length"][:]
+    names = [name for name in data if "hidden_goal" in name] or [name for name in data if name.startswith("pixels")]
+    images = stacked(data[name][0, : length + 1] for name in in_order(names))
+    return data["action"][0, :length], data["reward"][0, :length], images
 
 
 def read_replay_buffer(folder):
     data = zarr.open_group(str(folder / "replay_buffer.zarr"), mode="r")["data"]
-    images = data["img"] if "img" in data else data["img_top"]
-    return data["action"][:], data["reward"][:], images[:]
+    images = stacked(data[name][:] for name in in_order(name for name in data if name.startswith("img")))
+    return data["action"][:], data["reward"][:], images
 
 
 def read_minari(folder):
     minari = pytest.importorskip("minari")
     [episode] = minari.MinariDataset(folder / "data").iterate_episodes()
-    return episode.actions, episode.rewards, episode.observations["pixels"][..., :3]
+    return episode.actions, episode.rewards, episode.observations["pixels"]
 
 
 def read_lerobot(folder):
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet").to_pydict()
-    key = "observation.image" if "observation.image" in rows else "observation.images.top"
-    return rows["action"], rows["next.reward"], decoded(picture["bytes"] for picture in rows[key])
+    names = in_order(name for name in rows if name.startswith("observation.image"))
+    return rows["action"], rows["next.reward"], stacked([file["bytes"] for file in rows[name]] for name in names)
 
 
 def read_rlds(folder):
@@ -73,9 +94,9 @@ def read_rlds(folder):
     [place] = offsets(path)
     example = read_example(path, *place)
     rows = len(example["steps/reward"])
-    key = next(key for key in example if key.endswith("/pixels") or "top_camera" in key)
+    names = in_order(name for name in example if name.endswith("/pixels") or "camera" in name)
     actions = np.reshape(example["steps/action"], (rows, -1))[:-1]
-    return actions, example["steps/reward"][:-1], decoded(example[key])
+    return actions, example["steps/reward"][:-1], stacked(example[name] for name in names)
 
 
 def read_rerun(folder):
@@ -88,14 +109,15 @@ def read_rerun(folder):
                 order = np.argsort(batch.column("step").to_pylist())
                 rows = batch.column(name).to_pylist()
                 found.setdefault(part.entity_path.lstrip("/"), []).extend(rows[i] for i in order)
-    images = found["image"] if "image" in found else found["image/top"]
-    return found["action"], np.ravel(found["reward"]), decoded(bytes(blob[0]) for blob in images)
+    names = in_order(name for name in found if name.startswith("image"))
+    return found["action"], np.ravel(found["reward"]), stacked([bytes(b[0]) for b in found[name]] for name in names)
 
 
 READERS = {
     "hdf5": read_hdf5,
     "npz": read_npz,
     "replay-buffer": read_replay_buffer,
+    "zarr": read_zarr,
     "minari": read_minari,
     "lerobot": read_lerobot,
     "rlds": read_rlds,
@@ -119,18 +141,18 @@ class ExporterTests:
         [folder] = export(str(source), to, tmp_path, [name], (0, 1))
         assert export_format(folder) == to
         subset = dmcvb_gen.open(str(source))[name]
-        array = shown(subset).arrays[0]
-        stored = subset.episode(0, ["action", "reward", array])
+        views = ["pixels"] if name.startswith("walker") else [f"pixels_hidden_goal/{view}" for view in VIEWS]
+        stored = subset.episode(0, ["action", "reward", *views])
         actions, rewards, images = READERS[to](folder)
         np.testing.assert_array_equal(np.asarray(actions, np.float32), stored["action"])
         np.testing.assert_array_equal(np.asarray(rewards, np.float32), stored["reward"])
-        np.testing.assert_array_equal(images, stored[array][: len(images)])
+        np.testing.assert_array_equal(images, stacked(stored[view][: len(images)] for view in views))
         assert len(images) >= len(stored["reward"])
 
     def test_the_same_command_again_writes_nothing(self, source, release, to, tmp_path):
         again = [export(str(source), to, tmp_path, [SUBSETS[release]], (0, 1)) for _ in range(2)]
         assert again[0] == again[1]
-        with pytest.raises(DmcvbError, match="is there already"):
+        with pytest.raises(DmcvbError, match="holds something else"):
             export(str(source), to, tmp_path, [SUBSETS[release]], (1, 2))
 
     def test_no_file_names_a_folder_of_this_machine(self, source, release, to, tmp_path):
@@ -145,6 +167,31 @@ class ExporterTests:
 
 class TestExporters(ExporterTests):
     """The formats of this package."""
+
+
+@pytest.mark.parametrize("release", SUBSETS)
+def test_a_zarr_group_has_all_arrays_of_a_subset_for_zarr_and_xarray(release, request, tmp_path):
+    subset = dmcvb_gen.open(request.getfixturevalue(release))[SUBSETS[release]]
+    [folder] = export(request.getfixturevalue(release), "zarr", tmp_path, [subset.name], (1, 2))
+    with warnings.catch_warnings(action="error"):
+        group, data = (
+            zarr.open_group(str(folder / "data.zarr"), mode="r"),
+            xarray.open_zarr(folder / "data.zarr").load(),
+        )
+    names = {name: name.replace("/", "_") for name in subset.arrays}
+    assert {*group} == {*data.variables} == {*names.values(), "episode"}
+    assert data["episode"].values.tolist() == [1] and data["length"].dims == ("episode",)
+    for name, flat in names.items():
+        stored = subset.read(name, [1])
+        np.testing.assert_array_equal(group[flat][:], stored)
+        np.testing.assert_array_equal(data[flat].values, stored)
+        assert data[flat].dims == subset.array(name).dimensions and data[flat].dtype == stored.dtype
+    assert data.attrs["task"] == subset.task
+    assert (
+        data["action"].attrs["names"][-1]
+        == {"walker": "left_ankle", "ant": "walker/back_left_ankle"}[subset.task.split("-")[0]]
+    )
+    assert len(data["state"].attrs["names"]) == data["state"].shape[-1] and data.attrs["joints"]
 
 
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])

@@ -18,7 +18,6 @@ from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.import_tfds import import_tfds
-from dmcvb_gen.release.statistics import level_statistics
 from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
@@ -96,22 +95,19 @@ def check_imported_card(folder):
     for claim in ("regenerate", "full physics states", "`exogenous/`", "`physics`", "None samples", "seed None"):
         assert claim not in text, claim
     assert "exogenous/style" not in text
-    assert "can be made again from them" not in metadata and "roll out" not in metadata
-    return level_statistics(Release.open(folder))
+    assert "can be regenerated from them" not in metadata and "roll out" not in metadata
 
 
-def test_the_card_of_imported_locomotion(imported, small_release, tmp_path):
+def test_the_card_of_imported_locomotion(imported, tmp_path):
     shutil.copytree(imported, tmp_path / "r")
-    [found], [made] = check_imported_card(tmp_path / "r"), level_statistics(Release.open(small_release))
-    assert found.speed == pytest.approx(made.speed, rel=0.2) and found.height == pytest.approx(made.height, rel=0.1)
+    check_imported_card(tmp_path / "r")
 
 
 def test_the_card_of_imported_mazes(dmcvb_mazes, small_mazes, tmp_path):
     import_tfds(dmcvb_mazes, tmp_path / "r")
-    [found], ours = check_imported_card(tmp_path / "r"), Release.open(small_mazes)["ant-maze-tiny/random/fixed"]
-    place = get_task(ours.task).state_slices["walker_position"]
-    walked = [np.diff(ours.episode(int(e))["state"][:, place][:, :2], axis=0) for e in ours.episodes]
-    assert found.speed == pytest.approx(np.linalg.norm(np.concatenate(walked), axis=1).mean() / 0.05)
+    check_imported_card(tmp_path / "r")
+    share = Release.open(small_mazes)["ant-maze-tiny/random/fixed"].read("terminated").mean()
+    assert f"| `ant-maze-empty7x7/expert/fixed` | {share:.0%} |" in (tmp_path / "r/README.md").read_text()
 
 
 def test_damaged_or_foreign_folders_are_not_imported(rlds, tmp_path):

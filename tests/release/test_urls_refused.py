@@ -42,60 +42,6 @@ def test_no_command_makes_a_folder_of_a_url(small_release, elsewhere, name):
     assert not list(elsewhere.iterdir())
 
 
-def _repaint(root):
-    from dmcvb_gen.generate.repaint import Repainting, repaint
-
-    repaint(Repainting(root, Path(URL), size=8))
-
-
-def _import(root):
-    from dmcvb_gen.release.import_tfds import import_tfds
-
-    import_tfds(root, URL)
-
-
-def _card(root):
-    from dmcvb_gen.release.card import write_card
-
-    write_card(root, Path(URL))
-
-
-def _preview(root):
-    from dmcvb_gen.generate.preview import write_preview
-
-    write_preview(root, URL)
-
-
-def _export(root):
-    from dmcvb_gen.release.export import export
-
-    export(root, "hdf5", Path(URL))
-
-
-def _report(root):
-    from dmcvb_gen.benchmarks.plan import BUDGETS
-    from dmcvb_gen.benchmarks.report import claim_folder
-    from dmcvb_gen.dataset.gate import Release
-
-    claim_folder(URL, Release.open(root), BUDGETS["smoke"], training=True)
-
-
-def _train(root):
-    from dmcvb_gen.training.run import RunConfig, open_run
-
-    open_run(URL, RunConfig("walker-walk", "sac", 1, 0, {}), resume=False)
-
-
-CALLS = (_repaint, _import, _card, _preview, _export, _report, _train)
-
-
-@pytest.mark.parametrize("call", CALLS, ids=lambda call: call.__name__.strip("_"))
-def test_no_function_makes_a_folder_of_a_url(small_release, elsewhere, call):
-    with pytest.raises(StoreError, match="s3:/+bucket/x is a URL.*give a local one"):
-        call(small_release)
-    assert not list(elsewhere.iterdir())
-
-
 @pytest.mark.parametrize("command", ["publish", "fetch"])
 def test_a_url_with_a_slash_too_few_is_no_folder(small_release, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)

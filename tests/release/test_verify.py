@@ -14,7 +14,7 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import RenderingError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.release.fetch import fetch
-from dmcvb_gen.release.verify import check_files, verify
+from dmcvb_gen.release.verify import check_files, verify, verify_folder
 from tests.conftest import rewrite, roll_out, small_recipe
 
 NAME, MAZE = "walker-walk/random/dynamic", "ant-maze-tiny/random/visible"
@@ -92,7 +92,7 @@ DAMAGE = {
 @pytest.mark.parametrize("change", DAMAGE, ids=lambda change: change.__name__)
 def test_wrong_values_are_found_by_their_check(copy, change):
     rewrite(copy, NAME, change)
-    found = verify(copy, names=[NAME]).findings
+    found = verify_folder(copy, names=[NAME]).findings
     places = [{finding.check, finding.episode, finding.step} for finding in found]
     assert any(DAMAGE[change] <= place for place in places), found
     assert {finding.subset for finding in found} == {NAME}
@@ -100,7 +100,7 @@ def test_wrong_values_are_found_by_their_check(copy, change):
 
 def test_equal_actions_alone_are_no_duplicate(copy):
     rewrite(copy, NAME, repeat_actions)
-    assert not any(finding.check == "duplicates" for finding in verify(copy, names=[NAME]).findings)
+    assert not any(finding.check == "duplicates" for finding in verify_folder(copy, names=[NAME]).findings)
 
 
 def test_returns_of_longer_episodes_may_be_higher(tmp_path):

@@ -59,6 +59,18 @@ class Modality(abc.ABC):
     needs_next: ClassVar[bool] = False
     encoding: ClassVar[str]
 
+    @property
+    def levels(self) -> str | None:
+        """Words for the values of `gray`'s images; None if it makes none."""
+        low, high = self.bounds
+        if self.shape or np.dtype(self.dtype).kind not in "iu" or high - low >= 2**16:
+            return None
+        return f"16-bit level = value + {-low}" if low else "16-bit level = value"
+
+    def gray(self, values: np.ndarray) -> np.ndarray:
+        """(..., height, width) values -> uint16 images of the same shape, for formats that know images of 16 bits."""
+        return (values.astype(np.int64) - int(self.bounds[0])).astype(np.uint16)
+
     @abc.abstractmethod
     def compute(self, seen: Seen) -> np.ndarray:
         """(frame, size, size, *shape): the values of frames."""

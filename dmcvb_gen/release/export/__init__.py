@@ -1,7 +1,5 @@
 """Export a release's subsets in the formats that other programs read, one folder for each subset."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +10,13 @@ from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, sha256_bytes, write_json
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
+from dmcvb_gen.options import Local, Location, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import all_formats, get_format
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import is_url, local_path
+from dmcvb_gen.text import as_names
 
 STAMP = ".dmcvb-gen.json"
 """File in each export that says what it was made from, so that the same command can resume."""
@@ -44,66 +44,69 @@ class _Work:
                 return False
             if parse_json((self.folder / STAMP).read_bytes()) == self.stamp:
                 return True
-        raise StoreError(
-            f"{self.folder} is there already, and not of this release and these options; choose another --out"
-        )
+        raise StoreError(f"{self.folder} holds something else than this export of this release; choose another --out")
 
 
+@checked
 def export(
-    path: str,
+    release: Location,
     to: str,
-    out: str | Path,
-    only: Sequence[str] = (),
-    episodes: tuple[int, int] | None = None,
+    out: Local,
+    only: Names = (),
+    episode_range: Span | None = None,
     *,
     merge: bool = False,
     video: bool = False,
     workers: Workers = 1,
-    storage_options: dict | None = None,
-    tick: ProgressCallback = ignore,
+    storage_options: dict[str, Any] | None = None,
+    progress: bool = True,
 ) -> list[Path]:
-    """Write subsets in another format. Each is complete or absent, and the same call resumes an interrupted one.
+    """Write subsets in another format, a folder for each; the folders.
+
+    Each folder is complete or absent, and the same call resumes an interrupted one.
 
     Args:
-      path: a release, here or at a URL.
-      to: name of a format, see `all_formats`.
-      out: folder of the exports; each subset gets `<out>/<task>/<level>/<setting>` (minari has its own tree).
-      only: subset patterns; episodes: (first, last + 1), as far as a subset has so many; all by default.
-      merge: lerobot: all subsets as the tasks of one data set, `out` itself.
-      video: lerobot: pictures as mp4 (smaller, with losses) and not as PNG.
-      workers: processes (or a Ray cluster that sees the same folders), a subset each.
-      tick: called with 1 for each episode.
-
-    Returns:
-      The folders.
+      release (RELEASE|URL): Folder or URL of the release.
+      to: Format, for example hdf5, minari, lerobot, rlds or rerun.
+      out (FOLDER): Output folder, one folder per subset.
+      only (PATTERN): Export only these subsets.
+      episode_range (RANGE): Export only episodes A to B - 1.
+      merge: lerobot: write all subsets as the tasks of one data set.
+      video: lerobot: store images as mp4 (smaller, lossy) instead of PNG.
+      workers: Worker processes, one subset each.
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
 
     Raises:
       UnknownNameError: no such format or subset.
       DmcvbError: a package is not installed, or an option is not for this format.
-      StoreError: a subset is damaged or not whole (or lacks some of `episodes`), something else lies at `out`, or it
+      StoreError: a subset is damaged or not whole (or lacks some of the range), something else lies at `out`, or it
         cannot be written.
     """
-    kind, out = get_format(to), Path(local_path(out)).absolute()
+    kind, folder, path = get_format(to), Path(local_path(out)).absolute(), str(release)
     options = {name: True for name, given in (("video", video),) if given}
     for name in (*options, *["merge"] * merge):
         if name not in kind.options:
             raise DmcvbError(f"--{name} is not for {to}; it is for {', '.join(_formats_with(name))}")
     kind.check_installed()  # here, and not first in a worker
-    release = open_for_reading(path, storage_options)
-    if not is_url(str(path)) and Path(path).resolve() in (out.resolve(), *out.resolve().parents):
-        raise StoreError(f"--out {out} lies in the release itself; give another folder")
-    unions = [name for name in only if release.parts_of(name)]
-    others = [name for name in only if name not in unions]
-    names = [*(release.select(others) if others or not unions else ()), *unions]
-    chosen = tuple((name, _episodes(release[name], episodes)) for name in names)
-    folders = [out] if merge else [out / kind.folder_name(release, name) for name in names]
+    source = open_for_reading(path, storage_options)
+    if not is_url(path) and Path(path).resolve() in (folder.resolve(), *folder.resolve().parents):
+        raise StoreError(f"--out {folder} lies in the release itself; give another folder")
+    asked = as_names(only)
+    unions = [name for name in asked if source.parts_of(name)]
+    others = [name for name in asked if name not in unions]
+    names = [*(source.select(others) if others or not unions else ()), *unions]
+    chosen = tuple((name, _episodes(source[name], episode_range)) for name in names)
+    folders = [folder] if merge else [folder / kind.folder_name(source, name) for name in names]
     works = [
-        _Work(str(path), storage_options, to, options, part, folder, _stamp(release, to, options, part))
-        for part, folder in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
+        _Work(path, storage_options, to, options, part, place, _stamp(source, to, options, part))
+        for part, place in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
     ]
     todo = [work for work in works if not work.done]
-    expect(tick, sum(len(episodes) for work in todo for _, episodes in work.subsets))
-    with open_pool(workers, tick=tick, most=len(todo)) as pool:
+    with (
+        progress_bar(progress, " episodes", scaled=False) as bar,
+        open_pool(workers, tick=bar, most=len(todo)) as pool,
+    ):
+        expect(bar, sum(len(episodes) for work in todo for _, episodes in work.subsets))
         for work in todo:
             pool.submit(work.folder, _write, work)
         for _ in pool.results():
@@ -135,8 +138,8 @@ def _episodes(subset: SubsetReader, asked: tuple[int, int] | None) -> tuple[int,
     missing = [episode for episode in wanted if episode not in here]
     if missing:
         raise StoreError(
-            f"{name} has {len(wanted) - len(missing)} of {len(wanted)} episodes here, episode {missing[0]} is not; "
-            "finish the rollout or fetch the rest, or name what is here with --only and --range"
+            f"{name} has {len(wanted) - len(missing)} of {len(wanted)} episodes and lacks episode {missing[0]}; finish "
+            "the rollout, fetch the rest, or select existing ones with --only and --range"
         )
     return tuple(wanted)
 

@@ -96,6 +96,25 @@ class Source:
         return stored_in(self.subset.arrays)
 
     @property
+    def names(self) -> dict[str, list[str]]:
+        """Array ("state", "action") -> a name for each of its entries."""
+        state = [f"{name}.{i}" for name, (first, last) in self.fields.items() for i in range(last - first)]
+        size = self.subset.array("action").shape[-1]
+        actuators = self.subset.record.actuators or [""] * size
+        return {"state": state, "action": [name or f"actuator.{i}" for i, name in enumerate(actuators)]}
+
+    @property
+    def fields(self) -> dict[str, tuple[int, int]]:
+        """Field of the state -> its first entry, and the one after its last; in their order."""
+        fields = self.subset.spec("state").attributes["fields"]
+        return dict(sorted(fields.items(), key=lambda field: field[1]))
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the model's joints, in MuJoCo's order."""
+        return list(self.subset.record.joints)
+
+    @property
     def description(self) -> str:
         manifest = self.manifest
         return f"{self.subset.name} of {manifest.name} {manifest.version} ({manifest.license}), by dmcvb-gen"
@@ -117,7 +136,7 @@ class Source:
 
 
 def png(frame: np.ndarray) -> bytes:
-    """(height, width, 3) uint8 as a PNG file."""
+    """(height, width, 3) uint8, or (height, width) uint16, as a PNG file."""
     from PIL import Image
 
     buffer = io.BytesIO()

@@ -93,5 +93,5 @@ def _refuse_others(store: Store, paths: Sequence[str]) -> None:
         more = f" and {len(others) - 1} more" if others[1:] else ""
         raise StoreError(
             f"{store.place} holds {others[0]}{more}, which this export lacks and its readers would read with it; "
-            "remove what is there, or give another URL"
+            "remove the other files, or choose another URL"
         )

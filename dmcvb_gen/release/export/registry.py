@@ -63,6 +63,8 @@ class Format:
                 raise DmcvbError(f"export to {self.name}: {install_hint(name) or f'pip install {name}'}") from None
 
 
+READERS = {"tfds": "rlds", "d4rl": "hdf5", "v-d4rl": "hdf5", "dreamer": "npz", "diffusion-policy": "replay-buffer"}
+"""Reader that people ask for -> the format that it reads."""
 FORMATS: Registry[Format] = Registry("format", "dmcvb_gen.release.export.formats", "dmcvb_gen.exporters")
 
 
@@ -90,5 +92,8 @@ def get_format(name: str) -> Format:
 
     Raises:
       UnknownNameError: there is none; the message lists those that there are.
+      DmcvbError: it is the name of a reader; the message has the format that it reads.
     """
+    if name in READERS:
+        raise DmcvbError(f"unknown format {name!r}. Did you mean {READERS[name]!r}?")
     return FORMATS.get(name)

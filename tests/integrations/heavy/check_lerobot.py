@@ -37,20 +37,28 @@ for one in wanted:
 
 mazes = [one for one in wanted if one["subset"].startswith("ant-maze")]
 dataset, start = LeRobotDataset("local/merged", root=work / "merged"), 0
-assert dataset.num_episodes == 2 * len(mazes) and dataset.meta.total_tasks == 1, dataset.meta.tasks
+assert dataset.num_episodes == 2 * len(mazes) and dataset.meta.total_tasks == len(mazes), dataset.meta.tasks
 for one in mazes:
     stored = np.load(work / one["values"])
     for index in range(2):
         item = dataset[start]
-        assert item["task"] == "ant-maze-tiny:****/*..*/**** (random)", item["task"]
+        setting = one["subset"].rpartition("/")[2]
+        assert item["task"] == f"ant-maze-tiny:****/*..*/**** (random, {setting})", item["task"]
         np.testing.assert_array_equal(item["action"].numpy(), stored[f"action_{index}"][0])
         start += len(stored[f"action_{index}"])
 assert start == len(dataset)
 print(f"lerobot: {len(mazes)} subsets in one data set, {len(dataset)} frames", flush=True)
 
 dataset, stored = LeRobotDataset("local/causes", root=work / "causes_export"), np.load(work / "causes.npz")
+assert dataset.meta.depth_keys == ["observation.images.depth"], dataset.meta.depth_keys
 for step in (0, 7):
     for name in stored:
-        found = np.rint(dataset[step][f"observation.images.{name}"].numpy().transpose(1, 2, 0) * 255)
-        np.testing.assert_array_equal(found, stored[name][step])
+        found = dataset[step][f"observation.images.{name}"].numpy()
+        if stored[name].dtype == np.uint8:
+            np.testing.assert_array_equal(np.rint(found.transpose(1, 2, 0) * 255), stored[name][step])
+        else:
+            unit = 1000 if name == "depth" and dataset.depth_output_unit == "m" else 1
+            np.testing.assert_allclose(found[0] * unit, stored[name][step], rtol=1e-6)
+depth = dataset.meta.stats["observation.images.depth"]
+assert 0 < float(depth["mean"].ravel()[0]) <= float(depth["max"].ravel()[0]), depth
 print(f"lerobot: images of {', '.join(stored)} as stored", flush=True)

@@ -26,11 +26,12 @@ FORMATS = {"lerobot": ("lerobot",), "tfds": ("rlds",), "zarr2": ("replay-buffer"
 
 
 def export_modalities(work: Path) -> None:
-    """The walker with depth, segmentation and flow for LeRobot, and the images of the first episode beside."""
+    """The walker with all modalities for LeRobot, and the images of the first episode as they must come back."""
     repaint(Repainting(work / "walker", work / "causes", labels=list(all_modalities())))
     [subset] = Release.open(work / "causes").subsets.values()
     values = subset.episode(0, list(all_modalities()))
-    np.savez(work / "causes.npz", **{name: one.color(values[name]) for name, one in all_modalities().items()})
+    shown = {n: (one.gray if one.levels else one.color)(values[n]) for n, one in all_modalities().items()}
+    np.savez(work / "causes.npz", **shown)
     export(str(work / "causes"), "lerobot", work / "causes_export", merge=True)
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +35,7 @@ CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
 @register_exporter(
     "lerobot",
     reader="LeRobot v3 (Parquet with PNG images, or mp4), `datasets.load_dataset`",
-    keeps="pixels, states, actions, rewards, ends; depth, segmentation, flow as images",
+    keeps="pixels, states, actions, rewards, ends; depth, segmentation (16-bit images), flow",
     drops="the last observation of each episode, physics, labels",
     mark="meta/info.json",
     modules=("pyarrow",),
@@ -44,9 +44,10 @@ CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
 def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
     """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/`, `videos/` if asked for, and a card.
 
-    Several subsets are the tasks of one data set. Depth, segmentation and flow that are stored become images of their
-    own, "observation.images.depth", by `Modality.color`; info.json says how their values are read back. The last
-    observation of an episode has no action and is left out, as LeRobot's frames all have one.
+    Several subsets are the tasks of one data set. Modalities that are stored become images of their own: depth is
+    LeRobot's own depth feature in millimeters, segmentation has the number of the geom + 1, both as PNG of 16 bits
+    (`Modality.gray`), also beside videos; flow is in colors (`Modality.color`). info.json says how values are read. The
+    last observation of an episode has no action and is left out, as LeRobot's frames all have one.
 
     Raises:
       StoreError: the subsets do not fit into one data set, or pictures of this size into a video.
@@ -63,7 +64,7 @@ def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
             row |= {"dataset_from_index": index, "dataset_to_index": index + episode.length}
             row |= files.add(columns, episode, len(rows))
             rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
-            rows[-1] |= statistics.add(columns, layout.pictures(episode))
+            rows[-1] |= statistics.add(columns, layout.pictures(episode), layout.gray)
             index += episode.length
     files.close()
     _write_meta(folder, layout, rows, index, statistics)
@@ -140,7 +141,7 @@ class _Layout:
       tasks: their texts; `task_index` counts them. robot: what they have in common.
       rate, fps: steps a second, and the whole number that LeRobot takes for them; timestamps are made of that.
       keys: view -> feature of its pictures.
-      modalities: array of depth, segmentation or flow -> feature of its pictures.
+      modalities: array of depth, segmentation or flow -> feature of its pictures. gray: those of 16 bits.
       features: features as in info.json.
     """
 
@@ -162,12 +163,10 @@ class _Layout:
         single = len(first.views) == 1
         self.keys = {view: "observation.image" if single else f"observation.images.{view}" for view in first.views}
         self.modalities = {name: f"observation.images.{name.replace('/', '_')}" for name in first.modalities}
+        self.gray = {key for name, key in self.modalities.items() if modality_of(name).levels}
         self.features = self._features(first)
 
     def _features(self, source: Source) -> dict[str, Any]:
-        from dmcvb_gen.tasks import get_task
-
-        task = get_task(source.subset.task)
         scalar: dict[str, Any] = {"shape": [1], "names": None}
         picture: dict[str, Any] = {
             "dtype": "image",
@@ -176,8 +175,7 @@ class _Layout:
         }
         if self.video:
             picture |= {"dtype": "video", "info": self._video_info()}
-        state = [f"{field}.{i}" for field, size in task.state_fields.items() for i in range(size)]
-        actions = [task.model.actuator(i).name or f"actuator.{i}" for i in range(task.action_size)]
+        state, actions = source.names["state"], source.names["action"]
         return {
             **{key: picture for key in self.keys.values()},
             **{key: self._modality(picture, name) for name, key in self.modalities.items()},
@@ -191,8 +189,13 @@ class _Layout:
         }
 
     def _modality(self, picture: dict[str, Any], name: str) -> dict[str, Any]:
-        info = picture.get("info", {}) | {"encoding": modality_of(name).encoding}
-        return picture | {"info": info}
+        modality = modality_of(name)
+        if modality.levels is None:
+            return picture | {"info": picture.get("info", {}) | {"encoding": modality.encoding}}
+        info: dict[str, Any] = {"encoding": modality.levels}
+        if modality.name == "depth":
+            info |= {"is_depth_map": True, "depth_unit": "mm"}
+        return {"dtype": "image", "shape": [self.size, self.size, 1], "names": picture["names"], "info": info}
 
     def _video_info(self) -> dict[str, Any]:
         sizes = {"video.height": self.size, "video.width": self.size, "video.channels": 3}
@@ -200,11 +203,17 @@ class _Layout:
         return sizes | codec | {"video.fps": self.fps, "has_audio": False}
 
     def pictures(self, episode: ExportEpisode) -> dict[str, np.ndarray]:
-        """Feature -> (L, size, size, 3)."""
+        """Feature -> (L, size, size, 3) uint8, or (L, size, size) uint16 for those of 16 bits."""
         pictures = {key: episode.pixels[view][: episode.length] for view, key in self.keys.items()}
         for name, key in self.modalities.items():
-            pictures[key] = modality_of(name).color(episode.modalities[name][: episode.length])
+            modality, values = modality_of(name), episode.modalities[name][: episode.length]
+            pictures[key] = modality.gray(values) if modality.levels else modality.color(values)
         return pictures
+
+    @property
+    def videos(self) -> list[str]:
+        """Features that are videos."""
+        return [key for key, feature in self.features.items() if feature["dtype"] == "video"]
 
     def frames(self, episode: ExportEpisode, number: int, index: int, task: int) -> dict[str, np.ndarray]:
         """The columns of an episode but its pictures, each with a row a frame."""
@@ -268,14 +277,14 @@ class _Files:
             self._open(chunk, file)
         pictures = self._layout.pictures(episode)
         place: dict[str, Any] = {"data/chunk_index": chunk, "data/file_index": file}
-        if self._layout.video:
-            for key, frames in pictures.items():
-                for frame in frames:
-                    self._videos[key].send(np.ascontiguousarray(frame))
-                place |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
-                place[f"videos/{key}/from_timestamp"] = self._frames / self._layout.fps
-                place[f"videos/{key}/to_timestamp"] = (self._frames + len(frames)) / self._layout.fps
-        self._table.write_table(self._rows(columns, {} if self._layout.video else pictures))
+        for key in self._layout.videos:
+            frames = pictures[key]
+            for frame in frames:
+                self._videos[key].send(np.ascontiguousarray(frame))
+            place |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
+            place[f"videos/{key}/from_timestamp"] = self._frames / self._layout.fps
+            place[f"videos/{key}/to_timestamp"] = (self._frames + len(frames)) / self._layout.fps
+        self._table.write_table(self._rows(columns, pictures))
         self._frames += episode.length
         return place
 
@@ -299,7 +308,7 @@ class _Files:
         path = self._folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._table, self._frames = pq.ParquetWriter(path, self._schema), 0
-        for key in (*self._layout.keys.values(), *self._layout.modalities.values()) if self._layout.video else ():
+        for key in self._layout.videos:
             path = self._folder / VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
             path.parent.mkdir(parents=True, exist_ok=True)
             self._videos[key] = _video(path, self._layout.size, self._layout.fps)
@@ -339,12 +348,20 @@ class _Statistics:
     def __init__(self):
         self._parts: dict[str, list[dict[str, np.ndarray]]] = {}
 
-    def add(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> dict[str, list]:
-        """Take an episode up; gives its own statistics as columns "stats/<feature>/<statistic>"."""
+    def add(
+        self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray], gray: Collection[str]
+    ) -> dict[str, list]:
+        """Take an episode up; gives its own statistics as columns "stats/<feature>/<statistic>".
+
+        Args:
+          gray: pictures of 16 bits, whose statistics are in their own unit; those of others lie in [0, 1].
+        """
         flat: dict[str, list] = {}
         shape: tuple[int, ...]
         for name, value in (columns | pictures).items():
-            if name in pictures:  # a number a channel, in [0, 1]
+            if name in gray:
+                value, shape = value.reshape(-1, 1).astype(np.float64), (1, 1, 1)
+            elif name in pictures:  # a number a channel
                 value, shape = value.reshape(-1, 3) / 255.0, (3, 1, 1)
             else:
                 value = np.asarray(value, np.float64).reshape(len(value), -1)

@@ -69,6 +69,9 @@ def write(source: Source, folder: Path) -> None:
         "code_permalink": f"dmcvb-gen {__version__}",
         "description": source.description + _about_videos(source),
         "requirements": [f"dmcvb-gen>={__version__}"],
+        "state_names": source.names["state"],
+        "action_names": source.names["action"],
+        "joint_names": source.joints,
         "eval_env_spec": _environment(source, "val").to_json(),
     }
     if references := reference_returns(source.release, subset.record):

@@ -18,15 +18,16 @@ CHUNK = 161
 @register_exporter(
     "replay-buffer",
     reader="diffusion policy's `ReplayBuffer` (Zarr 2: `data/img`, `data/state`, `data/action`, `meta/episode_ends`)",
-    keeps="pixels, states, actions, rewards",
+    keeps="pixels, states, actions, rewards; depth, segmentation, flow",
     drops="the last observation of each episode, discounts, physics, labels",
     mark="replay_buffer.zarr/.zgroup",
 )
 def write(source: Source, folder: Path) -> None:
     """Write `replay_buffer.zarr`: `data/img` (step, height, width, 3) uint8 (`data/img_<view>` for several views),
-    `data/state`, `data/action`, `data/reward` float32, and `meta/episode_ends` int64."""
+    `data/state`, `data/action`, `data/reward` float32, stored modalities (`data/depth`), and `meta/episode_ends` int64.
+    The attributes name the entries of state and action, and the joints."""
     root = zarr.open_group(str(folder / "replay_buffer.zarr"), mode="w", zarr_format=2)
-    root.attrs["description"] = source.description
+    root.attrs.update({"description": source.description, "joints": source.joints})
     data, meta = root.create_group("data"), root.create_group("meta")
     ends: list[int] = []
     for episode in source:
@@ -34,6 +35,7 @@ def write(source: Source, folder: Path) -> None:
         single = len(episode.pixels) == 1
         values = {"img" if single else f"img_{view}": frames[:length] for view, frames in episode.pixels.items()}
         values |= {"state": episode.state[:length], "action": episode.action, "reward": episode.reward}
+        values |= {name: value[:length] for name, value in episode.named_modalities().items()}
         before = ends[-1] if ends else 0
         for name, value in values.items():
             if name not in data:
@@ -43,6 +45,7 @@ def write(source: Source, folder: Path) -> None:
                     chunks=(CHUNK, *value.shape[1:]),
                     dtype=value.dtype,
                     compressors=Blosc(cname="zstd", clevel=5, shuffle=Blosc.BITSHUFFLE),
+                    attributes={"names": source.names[name]} if name in source.names else {},
                 )
             stored = data[name]
             assert isinstance(stored, zarr.Array)

@@ -34,16 +34,18 @@ def _step_types(rows: int) -> np.ndarray:
 )
 def write_hdf5(source: Source, folder: Path) -> None:
     """Write `data_000.hdf5`, ...: `observation` (row, 3 * view, height, width) uint8, `action`, `reward`, `discount`,
-    `state` float32 and `step_type`, episodes one after the other; stored `depth`, `segmentation`, `flow` as well."""
+    `state` float32 and `step_type`, episodes one after the other; stored `depth`, `segmentation`, `flow` as well. The
+    attributes name the entries of state and action, and the joints."""
     import h5py
 
-    file, written = None, 0
+    file: Any = None
+    written = 0
     for episode in source:
         if written % EPISODES_PER_FILE == 0:
             if file:
                 file.close()
             file = h5py.File(folder / f"data_{written // EPISODES_PER_FILE:03d}.hdf5", "w")
-            file.attrs["description"] = source.description
+            file.attrs.update({"description": source.description, "joints": source.joints})
         values = {
             "observation": episode.stacked().transpose(0, 3, 1, 2),
             **episode.arrived(),
@@ -53,6 +55,8 @@ def write_hdf5(source: Source, folder: Path) -> None:
         }
         for name, value in values.items():
             _append(file, name, value)
+        for name, entries in source.names.items():
+            file[name].attrs["names"] = entries
         written += 1
     if file:
         file.close()
