@@ -115,4 +115,4 @@ def refuse(reason: str, **given: Any) -> None:
     """
     for name, value in given.items():
         if value:
-            raise DmcvbError(f"--{name} has no effect: {reason}; remove it")
+            raise DmcvbError(f"--{name.replace('_', '-')} has no effect: {reason}; remove it")

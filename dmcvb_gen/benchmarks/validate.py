@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from dmcvb_gen.benchmarks.report import Validation
 
 TRAINING = (
-    *("benchmarks", "agents", "profile", "scale", "seed", "train_unsound"),
+    *("agents", "profile", "scale", "seed", "train_unsound"),
     *("threads", "device", "precision", "compile", "dino_weights"),
 )
-"""Options of `validate` that say what is trained, and how."""
+"""Options of `validate`, beside the benchmarks, that say what is trained, and how."""
 
 
 @checked
@@ -81,7 +81,8 @@ def validate(
 
     if checks_only:
         usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
-        refuse("--checks-only trains nothing", **{name: given[name] != usual[name] for name in TRAINING})
+        changed = {name: given[name] != usual[name] for name in TRAINING}
+        refuse("--checks-only trains nothing", benchmark=benchmarks != usual["benchmarks"], **changed)
     names = [name for text in as_names(agents) for name in split_agents(text)]
     encoders = [agent.ready_encoder for agent in map(parse_agent, names) if agent.ready_encoder]
     if dino_weights is not None and not encoders:
