@@ -1,16 +1,15 @@
-"""What LeRobot's layout promises, read with `datasets`, pyarrow and a video decoder (LeRobot itself: by script)."""
+"""What LeRobot's layout promises, read with `datasets` and pyarrow (LeRobot itself: by script)."""
 
 from __future__ import annotations
 
 import json
 
 import datasets
-import imageio.v3 as iio
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.release.export import export
 from tests.conftest import roll_out
@@ -78,28 +77,6 @@ def test_several_subsets_become_the_tasks_of_one_data_set(stored, tmp_path):
         export(release, "npz", tmp_path / "x", merge=True)
 
 
-@pytest.mark.slow
-def test_videos_have_a_frame_a_step(stored, tmp_path):
-    name = "ant-maze-tiny/random/hidden"
-    [folder] = export(str(stored[name].folder), "lerobot", tmp_path, [name], video=True)
-    info = json.loads((folder / "meta/info.json").read_text())
-    rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    episodes = [stored[name].episode(index) for index in range(2)]
-    for view, key in enumerate(keys(stored[name])):
-        assert info["features"][key]["dtype"] == "video"
-        frames = iio.imread(
-            folder / info["video_path"].format(video_key=key, chunk_index=0, file_index=0), plugin="FFMPEG"
-        )
-        assert len(frames) == sum(length for length, _, _ in episodes)
-        start = 0
-        for row, (length, values, _) in zip(rows, episodes, strict=True):
-            assert row[f"videos/{key}/from_timestamp"] == start / info["fps"]
-            assert row[f"videos/{key}/to_timestamp"] == (start + length) / info["fps"]
-            painted = values["pixels"][:length, view].astype(float)
-            assert np.abs(frames[start : start + length] - painted).mean() < 12  # 4:2:0 of 16 pixels
-            start += length
-
-
 def lerobots_features(info):
     """The columns that LeRobot asks `datasets` for: one number is a scalar, several are a sequence."""
     found = {}
@@ -123,19 +100,3 @@ def test_one_action_and_broken_rates_fit_lerobots_own_checks(task, tmp_path):
     assert np.shape(table["action"][:]) == ((60,) if task.startswith("pendulum") else (60, 5))
     np.testing.assert_allclose(np.diff(table["timestamp"][:30]), 1 / info["fps"], atol=1e-5)  # LeRobot allows 1e-4
     assert ("16.67 steps a second" in (folder / "README.md").read_text()) == task.startswith("swimmer")
-
-
-def test_odd_sizes_make_no_videos(stored, tmp_path, monkeypatch):
-    one = stored["walker-walk/random/static"]
-    from dmcvb_gen.release.export.formats import lerobot
-
-    monkeypatch.setattr(lerobot, "_shape", lambda source: ())
-    real = lerobot._Layout.__init__
-
-    def odd(self, sources, video):
-        object.__setattr__(sources[0].subset, "record", sources[0].subset.record.model_copy(update={"size": 17}))
-        real(self, sources, video)
-
-    monkeypatch.setattr(lerobot._Layout, "__init__", odd)
-    with pytest.raises(StoreError, match="even size"):
-        export(str(one.folder), "lerobot", tmp_path, [one.name], video=True)

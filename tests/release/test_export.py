@@ -245,8 +245,6 @@ def test_mistakes_are_answered(small_release, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="none of the episodes 50:60"):
         export(small_release, "npz", tmp_path, episode_range=(50, 60))
 
-    with pytest.raises(DmcvbError, match="--video is not for hdf5"):
-        export(small_release, "hdf5", tmp_path, video=True)
     with pytest.raises(StoreError, match="s3://bucket/x is a URL; give a local one"):
         export(small_release, "npz", "s3://bucket/x")
     monkeypatch.setitem(sys.modules, "h5py", None)

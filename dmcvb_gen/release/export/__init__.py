@@ -13,7 +13,7 @@ from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_read
 from dmcvb_gen.options import Local, Location, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
-from dmcvb_gen.release.export.registry import all_formats, get_format
+from dmcvb_gen.release.export.registry import get_format
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import is_url, local_path
 from dmcvb_gen.text import as_names
@@ -29,7 +29,6 @@ class _Work:
     path: str
     storage_options: dict | None
     to: str
-    options: dict[str, Any]
     subsets: tuple[tuple[str, tuple[int, ...]], ...]
     folder: Path
     stamp: dict[str, Any]
@@ -56,7 +55,6 @@ def export(
     episode_range: Span | None = None,
     *,
     merge: bool = False,
-    video: bool = False,
     workers: Workers = 1,
     storage_options: dict[str, Any] | None = None,
     progress: bool = True,
@@ -72,7 +70,6 @@ def export(
       only (PATTERN): Export only these subsets.
       episode_range (RANGE): Export only episodes A to B - 1.
       merge: lerobot: write all subsets as the tasks of one data set.
-      video: lerobot: store images as mp4 (smaller, lossy) instead of PNG.
       workers: Worker processes, one subset each.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
 
@@ -83,10 +80,8 @@ def export(
         cannot be written.
     """
     kind, folder, path = get_format(to), Path(local_path(out)).absolute(), str(release)
-    options = {name: True for name, given in (("video", video),) if given}
-    for name in (*options, *["merge"] * merge):
-        if name not in kind.options:
-            raise DmcvbError(f"--{name} is not for {to}; it is for {', '.join(_formats_with(name))}")
+    if merge and not kind.merges:
+        raise DmcvbError(f"--merge is not for {to}; it is for lerobot")
     kind.check_installed()  # here, and not first in a worker
     source = open_for_reading(path, storage_options)
     if not is_url(path) and Path(path).resolve() in (folder.resolve(), *folder.resolve().parents):
@@ -98,7 +93,7 @@ def export(
     chosen = tuple((name, _episodes(source[name], episode_range)) for name in names)
     folders = [folder] if merge else [folder / kind.folder_name(source, name) for name in names]
     works = [
-        _Work(path, storage_options, to, options, part, place, _stamp(source, to, options, part))
+        _Work(path, storage_options, to, part, place, _stamp(source, to, part))
         for part, place in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
     ]
     todo = [work for work in works if not work.done]
@@ -114,18 +109,14 @@ def export(
     return folders
 
 
-def _stamp(release: ReleaseReader, to: str, options: dict, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
-    """What an export was made from: release, format, options, and the records of the shards that it reads."""
+def _stamp(release: ReleaseReader, to: str, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
+    """What an export was made from: release, format, and the records of the shards that it reads."""
     content = []
     for name, episodes in subsets:
         shards = release[name].shards((episodes[0], episodes[-1] + 1))
         digest = sha256_bytes(b"".join(canonical_json(shard.record) for shard in shards))
         content.append([name, digest, list(episodes)])
-    return dict(release=release.manifest.name, format=to, options=options, subsets=content)
-
-
-def _formats_with(option: str) -> list[str]:
-    return [name for name, kind in all_formats().items() if option in kind.options]
+    return dict(release=release.manifest.name, format=to, subsets=content)
 
 
 def _episodes(subset: SubsetReader, asked: tuple[int, int] | None) -> tuple[int, ...]:
@@ -155,7 +146,7 @@ def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
         with folder_in_the_making(parent, work.folder.name) as made:
             inside = made / work.folder.name
             inside.mkdir()
-            kind.write(sources if "merge" in kind.options else sources[0], inside, **work.options)
+            kind.write(sources if kind.merges else sources[0], inside)
             write_json(inside / STAMP, work.stamp)
             if not work.done:  # somebody else may have been faster
                 inside.rename(work.folder)

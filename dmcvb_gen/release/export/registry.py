@@ -34,12 +34,12 @@ class Format:
 
     Attributes:
       name: name for `--to`.
-      write: writes a subset (`Source`) to an empty folder; with the option "merge", a list of subsets.
+      write: writes a subset (`Source`) to an empty folder; a list of subsets if the format `merges` them.
       reader: the program that reads it.
       keeps, drops: which parts of a subset it contains and which it leaves out, in words.
       mark: pattern of a file that only this format has.
       modules: modules that it imports beyond dmcvb-gen's own dependencies.
-      options: the options of `export` that it takes.
+      merges: whether one export can have several subsets (`--merge`).
       folder_name: (release, subset) -> folder below `--out`.
     """
 
@@ -50,7 +50,7 @@ class Format:
     drops: str
     mark: str
     modules: tuple[str, ...] = ()
-    options: tuple[str, ...] = ()
+    merges: bool = False
     folder_name: Callable[[Release, str], str] = subset_folder
 
     def check_installed(self) -> None:

@@ -60,8 +60,6 @@ def main() -> None:
             for what in chosen:
                 for to in FORMATS[what]:
                     [folders[to]] = map(str, export(str(folder), to, work / to, [subset.name]))
-                if what == "lerobot":
-                    [folders["video"]] = map(str, export(str(folder), to, work / "video", [subset.name], video=True))
             wanted.append({"subset": subset.name, "values": f"{flat}.npz", "hidden": pictures.hide_goal, **folders})
     if "lerobot" in chosen:
         export(str(work / "maze"), "lerobot", work / "merged", merge=True)

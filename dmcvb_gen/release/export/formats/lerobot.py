@@ -1,4 +1,4 @@
-"""LeRobot's dataset layout, version 3 (github.com/huggingface/lerobot): Parquet tables with PNG images, or mp4.
+"""LeRobot's dataset layout, version 3 (github.com/huggingface/lerobot): Parquet tables with PNG images.
 
 `datasets.load_dataset(folder)` reads the tables, too: their schema says that the pictures are pictures.
 """
@@ -24,35 +24,32 @@ VERSION = "v3.0"
 CHUNK_FILES, DATA_MB, VIDEO_MB = 1000, 100, 500
 """LeRobot's defaults: files a folder, megabytes a file."""
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 EPISODES_PER_FILE = 50
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-CODEC, PIXEL_FORMAT, QUALITY, KEY_FRAMES = "libx264", "yuv420p", 18, 2
-"""Of videos: nearly without loss (crf), and a key frame every second frame, so that any frame is decoded quickly."""
 
 
 @register_exporter(
     "lerobot",
-    reader="LeRobot v3 (Parquet with PNG images, or mp4), `datasets.load_dataset`",
+    reader="LeRobot v3 (Parquet with PNG images), `datasets.load_dataset`",
     keeps="pixels, states, actions, rewards, ends; depth, segmentation (16-bit images), flow",
     drops="the last observation of each episode, physics, labels",
     mark="meta/info.json",
     modules=("pyarrow",),
-    options=("merge", "video"),
+    merges=True,
 )
-def write(sources: Sequence[Source], folder: Path, video: bool = False) -> None:
-    """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/`, `videos/` if asked for, and a card.
+def write(sources: Sequence[Source], folder: Path) -> None:
+    """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/` and a card.
 
     Several subsets are the tasks of one data set. Modalities that are stored become images of their own: depth is
     LeRobot's own depth feature in millimeters, segmentation has the number of the geom + 1, both as PNG of 16 bits
-    (`Modality.gray`), also beside videos; flow is in colors (`Modality.color`). info.json says how values are read. The
+    (`Modality.gray`); flow is in colors (`Modality.color`). info.json says how values are read. The
     last observation of an episode has no action and is left out, as LeRobot's frames all have one.
 
     Raises:
-      StoreError: the subsets do not fit into one data set, or pictures of this size into a video.
+      StoreError: the subsets do not fit into one data set.
     """
-    layout = _Layout(sources, video)
+    layout = _Layout(sources)
     (folder / "meta").mkdir()
     files, statistics, index = _Files(folder, layout), _Statistics(), 0
     rows: list[dict[str, Any]] = []
@@ -101,7 +98,7 @@ def _write_meta(folder: Path, layout: _Layout, rows: list[dict], frames: int, st
         "fps": layout.fps,
         "splits": {"train": f"0:{len(rows)}"},
         "data_path": DATA_PATH,
-        "video_path": VIDEO_PATH if layout.video else None,
+        "video_path": None,
         "features": layout.features,
     }
     (folder / "meta/info.json").write_text(json.dumps(info, indent=1))
@@ -145,7 +142,7 @@ class _Layout:
       features: features as in info.json.
     """
 
-    def __init__(self, sources: Sequence[Source], video: bool):
+    def __init__(self, sources: Sequence[Source]):
         first = sources[0]
         for source in sources:
             if _shape(source) != _shape(first):
@@ -153,9 +150,7 @@ class _Layout:
                     f"{source.subset.name} and {first.subset.name} differ in views, size, state, action or "
                     "modalities, so they do not fit into one data set; merge fewer with --only"
                 )
-        self.sources, self.video, self.size = sources, video, first.subset.record.size
-        if video and self.size % 2:
-            raise StoreError(f"videos need an even size, these images have {self.size} pixels; remove --video")
+        self.sources, self.size = sources, first.subset.record.size
         self.tasks = list(dict.fromkeys(_task_texts(sources)))
         tasks = {source.subset.task for source in sources}
         self.robot = tasks.pop() if len(tasks) == 1 else first.subset.record.family
@@ -173,8 +168,6 @@ class _Layout:
             "shape": [self.size, self.size, 3],
             "names": ["height", "width", "channel"],
         }
-        if self.video:
-            picture |= {"dtype": "video", "info": self._video_info()}
         state, actions = source.names["state"], source.names["action"]
         return {
             **{key: picture for key in self.keys.values()},
@@ -191,16 +184,11 @@ class _Layout:
     def _modality(self, picture: dict[str, Any], name: str) -> dict[str, Any]:
         modality = modality_of(name)
         if modality.levels is None:
-            return picture | {"info": picture.get("info", {}) | {"encoding": modality.encoding}}
+            return picture | {"info": {"encoding": modality.encoding}}
         info: dict[str, Any] = {"encoding": modality.levels}
         if modality.name == "depth":
             info |= {"is_depth_map": True, "depth_unit": "mm"}
         return {"dtype": "image", "shape": [self.size, self.size, 1], "names": picture["names"], "info": info}
-
-    def _video_info(self) -> dict[str, Any]:
-        sizes = {"video.height": self.size, "video.width": self.size, "video.channels": 3}
-        codec = {"video.codec": "h264", "video.pix_fmt": PIXEL_FORMAT, "video.is_depth_map": False}
-        return sizes | codec | {"video.fps": self.fps, "has_audio": False}
 
     def pictures(self, episode: ExportEpisode) -> dict[str, np.ndarray]:
         """Feature -> (L, size, size, 3) uint8, or (L, size, size) uint16 for those of 16 bits."""
@@ -209,11 +197,6 @@ class _Layout:
             modality, values = modality_of(name), episode.modalities[name][: episode.length]
             pictures[key] = modality.gray(values) if modality.levels else modality.color(values)
         return pictures
-
-    @property
-    def videos(self) -> list[str]:
-        """Features that are videos."""
-        return [key for key, feature in self.features.items() if feature["dtype"] == "video"]
 
     def frames(self, episode: ExportEpisode, number: int, index: int, task: int) -> dict[str, np.ndarray]:
         """The columns of an episode but its pictures, each with a row a frame."""
@@ -239,8 +222,6 @@ class _Layout:
         huggingface: dict[str, Any] = {}
         told: dict[str, Any]
         for name, feature in self.features.items():
-            if feature["dtype"] == "video":
-                continue
             if feature["dtype"] == "image":
                 kind, told = pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
             else:
@@ -261,13 +242,11 @@ def _shape(source: Source) -> tuple:
 
 
 class _Files:
-    """The tables and videos, `EPISODES_PER_FILE` episodes a file, a row group an episode."""
+    """The tables, `EPISODES_PER_FILE` episodes a file, a row group an episode."""
 
     def __init__(self, folder: Path, layout: _Layout):
         self._folder, self._layout, self._schema = folder, layout, layout.schema()
         self._table: Any = None
-        self._videos: dict[str, Any] = {}
-        self._frames = 0
 
     def add(self, columns: dict[str, np.ndarray], episode: ExportEpisode, number: int) -> dict[str, Any]:
         """Write an episode; gives where it is, as columns of the table of episodes."""
@@ -277,15 +256,7 @@ class _Files:
             self._open(chunk, file)
         pictures = self._layout.pictures(episode)
         place: dict[str, Any] = {"data/chunk_index": chunk, "data/file_index": file}
-        for key in self._layout.videos:
-            frames = pictures[key]
-            for frame in frames:
-                self._videos[key].send(np.ascontiguousarray(frame))
-            place |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
-            place[f"videos/{key}/from_timestamp"] = self._frames / self._layout.fps
-            place[f"videos/{key}/to_timestamp"] = (self._frames + len(frames)) / self._layout.fps
         self._table.write_table(self._rows(columns, pictures))
-        self._frames += episode.length
         return place
 
     def _rows(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> pa.Table:
@@ -307,38 +278,13 @@ class _Files:
 
         path = self._folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._table, self._frames = pq.ParquetWriter(path, self._schema), 0
-        for key in self._layout.videos:
-            path = self._folder / VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._videos[key] = _video(path, self._layout.size, self._layout.fps)
+        self._table = pq.ParquetWriter(path, self._schema)
 
     def close(self) -> None:
         """End the files that are open."""
         if self._table is not None:
             self._table.close()
-        for video in self._videos.values():
-            video.close()
-        self._table, self._videos = None, {}
-
-
-def _video(path: Path, size: int, fps: int):
-    """An encoder that takes (size, size, 3) uint8 frames by `send`."""
-    import imageio_ffmpeg
-
-    options = ["-crf", str(QUALITY), "-g", str(KEY_FRAMES)]
-    encoder = imageio_ffmpeg.write_frames(
-        str(path),
-        (size, size),
-        fps=fps,
-        codec=CODEC,
-        quality=None,
-        pix_fmt_out=PIXEL_FORMAT,
-        macro_block_size=2,
-        output_params=options,
-    )
-    encoder.send(None)
-    return encoder
+        self._table = None
 
 
 class _Statistics:
