@@ -45,14 +45,14 @@ GROUPS = {
         "diff": ("release:diff_command", "Compare two releases: subsets, episodes and digests."),
     },
     "Share": {
-        "card": ("release:card", "Write the card of a release: README.md, croissant.json, images."),
+        "card": ("view:card", "Write the card of a release: README.md, croissant.json, images."),
         "publish": ("release:publish", "Upload a release: s3://, gs://, hf:// or any fsspec URL."),
         "fetch": ("paint:fetch", "Download a published release, or a part of it."),
     },
     "Convert": {
         "convert-policy": ("behaviours:convert_policy", "Convert a policy of Stable-Baselines3 or torch (CleanRL)."),
         "export": ("release:export", "Write subsets as HDF5, Minari, LeRobot, RLDS, Zarr, ..."),
-        "import": ("release:import_command", "Import DMC-VB's published TFDS folders into a release."),
+        "import": ("view:import_command", "Import DMC-VB's published TFDS folders into a release."),
     },
 }
 """Heading -> command -> ("module:attribute" under `dmcvb_gen.cli`, short help)."""

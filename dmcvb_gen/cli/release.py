@@ -8,10 +8,9 @@ from pathlib import Path
 import click
 
 from dmcvb_gen import making
-from dmcvb_gen.cli.common import OutPath, answer, json_option, moved_files, remote_option
+from dmcvb_gen.cli.common import answer, json_option, moved_files, remote_option
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.dataset.manifest import VIDEOS
-from dmcvb_gen.options import progress_bar, refuse
 from dmcvb_gen.release.export import export as run_export
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.release.publish import publish as run_publish
@@ -148,34 +147,6 @@ def publish(release, url, as_json, **options):
     answer(as_json, dataclasses.asdict(moved), f"{shown(url)}: {moved_files(moved)}")
 
 
-@click.command()
-@click.argument("path", metavar="RELEASE")
-@click.option("--check", is_flag=True, help="Compare the card with the release and write nothing.")
-@click.option("--out", metavar="FOLDER", type=OutPath(), help="Folder of the card.  [default: the release]")
-@click.option("--url", help="URL of the published release.  [default: the card's]")
-@json_option
-def card(path, check, out, url, as_json):
-    """Write a release's card: README.md (with a Hugging Face header), croissant.json, pictures, a table.
-
-    The table, card/episodes.parquet, has one row for each episode, with its first frame. `datasets.load_dataset` reads
-    it.
-
-    With --check, exit code 1 if the card does not match the data; of a fetched part, the table's rows are compared.
-
-    \b
-    dmcvb-gen card releases/mini
-    """
-    from dmcvb_gen.release.card import check_card, write_card
-
-    if check:
-        refuse("--check writes no card", out=out, url=url)
-        findings = check_card(path)
-        lines = findings or [f"{path}: the card matches the data"]
-        return answer(as_json, findings, *lines, code=1 if findings else 0)
-    files = list(map(str, write_card(path, out, url)))
-    answer(as_json, files, *files)
-
-
 @command_of(run_export)
 def export(release, to, out, as_json, **options):
     """Write subsets in another format: a folder for each subset. Rerun the command to resume.
@@ -188,32 +159,6 @@ def export(release, to, out, as_json, **options):
     folders = run_export(release, to, out, **options)
     shown = [str(Path(out) / folder.relative_to(Path(out).absolute())) for folder in folders]  # as --out names them
     answer(as_json, shown, *shown)
-
-
-@click.command("import")
-@click.argument("folder")
-@click.option("--task", help="Task of a folder whose path does not name it.")
-@click.option("--level", help="Level of such a folder.")
-@click.option("--setting", help="Setting of such a folder: none, static_medium, dynamic_medium, ...")
-@click.option("--name", default="dmc-vb-original", show_default=True, help="Name of the new release.")
-@click.option("--partial", is_flag=True, help="Import the files found, even if some are missing.")
-@click.option("--out", metavar="FOLDER", type=OutPath(), required=True, help="Folder of the new release.")
-@json_option
-def import_command(folder, task, level, setting, name, partial, out, as_json):
-    """Import DMC-VB's published TFDS folders (locomotion and mazes) into a release, without TensorFlow.
-
-    Rerun the command to resume.
-
-    \b
-    dmcvb-gen import dmc_vb/locomotion --out releases/original
-    """
-    from dmcvb_gen.release.import_tfds import import_tfds
-
-    with progress_bar(not as_json, " episodes", scaled=False) as bar:
-        given = dict(task=task, level=level, setting=setting, name=name, partial=partial, progress=bar)
-        manifest = import_tfds(folder, out, **given).manifest
-    made = (f"{subset.name}: {pluralize(subset.episodes, 'episodes')}" for subset in manifest.subsets)
-    answer(as_json, {"out": out, "subsets": [subset.name for subset in manifest.subsets]}, *made)
 
 
 @click.command("diff")

@@ -1,4 +1,4 @@
-"""view."""
+"""view, card, import."""
 
 from __future__ import annotations
 
@@ -6,23 +6,18 @@ import webbrowser
 
 import click
 
-from dmcvb_gen.cli.common import OutPath, json_option, print_json, remote_option
-from dmcvb_gen.cli.options import Finite
-from dmcvb_gen.progress import ProgressBar
+from dmcvb_gen.cli.common import answer
+from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.options import refuse
+from dmcvb_gen.release.card import check_card, write_card
+from dmcvb_gen.release.import_tfds import import_tfds
+from dmcvb_gen.release.viewer import view as write_viewer
 from dmcvb_gen.text import format_bytes, pluralize
 
 
-@click.command()
-@click.argument("path", metavar="RELEASE|URL")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Show only these subsets. Repeatable.")
-@click.option("--episodes", type=click.IntRange(1), help="Episodes of each subset.  [default: 12 in all]")
-@click.option("--size", type=click.IntRange(8, 1024), help="Render the images at this size instead of the stored one.")
-@click.option("--max-mb", type=Finite(0.1), default=20.0, show_default=True, help="Largest file.")
+@command_of(write_viewer)
 @click.option("--open/--no-open", "open_it", default=None, help="Open the file.  [default: if there is a browser]")
-@click.option("--out", metavar="FILE", type=OutPath(), help="The file.  [default: RELEASE/preview/viewer.html]")
-@remote_option
-@json_option
-def view(path, only, episodes, size, max_mb, open_it, out, options, as_json):
+def view(open_it, as_json, **options):
     """Write one HTML file that plays episodes: images, reward, actions, states and distractor labels.
 
     The file works without a network. Images that the release does not store are rendered for it.
@@ -31,17 +26,10 @@ def view(path, only, episodes, size, max_mb, open_it, out, options, as_json):
     dmcvb-gen view releases/demo
     dmcvb-gen view releases/demo --only 'walker-walk/expert/*' --size 256
     """
-    from dmcvb_gen.release.viewer import view as write
-
-    given = dict(only=only, episodes=episodes, size=size, max_bytes=int(max_mb * 1e6), storage_options=options)
-    with ProgressBar(not as_json, unit=" episodes") as bar:
-        written = write(path, out, **given, progress=bar)
-    if as_json:
-        print_json(vars(written))
-    else:
-        shows = f"{pluralize(written.episodes, 'episodes')} of {pluralize(written.subsets, 'subsets')}"
-        left_out = f", one image in {written.stride}" if written.stride > 1 else ""
-        click.echo(f"{written.path}: {shows}{left_out}, {format_bytes(written.bytes)}")
+    written = write_viewer(**options)
+    shows = f"{pluralize(written.episodes, 'episodes')} of {pluralize(written.subsets, 'subsets')}"
+    left_out = f", one image in {written.stride}" if written.stride > 1 else ""
+    answer(as_json, vars(written), f"{written.path}: {shows}{left_out}, {format_bytes(written.bytes)}")
     if open_it or (open_it is None and not as_json and _has_browser()):
         webbrowser.open(written.path.resolve().as_uri())
 
@@ -52,3 +40,39 @@ def _has_browser() -> bool:
         return not isinstance(webbrowser.get(), webbrowser.GenericBrowser)
     except webbrowser.Error:
         return False
+
+
+@command_of(write_card)
+@click.option("--check", is_flag=True, help="Compare the card with the release and write nothing.")
+def card(release, check, out, url, as_json, progress):
+    """Write a release's card: README.md (with a Hugging Face header), croissant.json, images, a table.
+
+    The table, card/episodes.parquet, has one row for each episode, with its first frame. `datasets.load_dataset` reads
+    it.
+
+    With --check, exit code 1 if the card does not match the data; of a fetched part, the table's rows are compared.
+
+    \b
+    dmcvb-gen card releases/mini
+    """
+    if check:
+        refuse("--check writes no card", out=out, url=url)
+        findings = check_card(release)
+        lines = findings or [f"{release}: the card matches the data"]
+        return answer(as_json, findings, *lines, code=1 if findings else 0)
+    files = list(map(str, write_card(release, out, url)))
+    answer(as_json, files, *files)
+
+
+@command_of(import_tfds)
+def import_command(out, as_json, **options):
+    """Import DMC-VB's published TFDS folders (locomotion and mazes) into a release, without TensorFlow.
+
+    Rerun the command to resume.
+
+    \b
+    dmcvb-gen import dmc_vb/locomotion --out releases/original
+    """
+    manifest = import_tfds(out=out, **options).manifest
+    made = (f"{subset.name}: {pluralize(subset.episodes, 'episodes')}" for subset in manifest.subsets)
+    answer(as_json, {"out": out, "subsets": [subset.name for subset in manifest.subsets]}, *made)

@@ -3,8 +3,6 @@
 Everything in a card comes from the manifest and the data. `check_card` writes another one and compares the files.
 """
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import json
@@ -29,6 +27,7 @@ from dmcvb_gen.generate.info import describe_release
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
+from dmcvb_gen.options import Local, Location, checked
 from dmcvb_gen.policies.header import OWN_CODE, origin_of
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.croissant import (
@@ -66,22 +65,24 @@ CITATION = """@inproceedings{ortiz2024dmcvb,
 }"""
 
 
-def write_card(root: str | Path, out: str | Path | None = None, url: str | None = None) -> list[Path]:
+@checked
+def write_card(release: Location, out: Local | None = None, url: str | None = None) -> list[Path]:
     """Write README.md, croissant.json, pictures and the table of episodes.
 
     Args:
-      out: folder of these files; the release by default.
-      url: URL at which the release is (or will be) published; by default the one that the existing card names.
+      release (RELEASE): Folder of the release.
+      out (FOLDER): Folder of the card. [default: the release]
+      url: URL of the published release. [default: the card's]
 
     Raises:
       StoreError: there is no release, it has no episodes, or the folder cannot be written or has another README.md.
     """
-    release = _open(root)
-    folder = local_path(out) if out else release.path
+    opened = _open(release)
+    folder = local_path(out) if out else opened.path
     _refuse_another_readme(folder)
     store = open_store(folder)
     with tempfile.TemporaryDirectory() as scratch:  # so that a failure leaves no half of a card
-        names = _write_files(release, Path(scratch), folder, _published(folder, release.manifest, url))
+        names = _write_files(opened, Path(scratch), folder, _published(folder, opened.manifest, url))
         for name in names:
             store.replace(name, (Path(scratch) / name).read_bytes())
     return [folder / name for name in names]

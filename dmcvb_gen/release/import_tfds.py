@@ -4,8 +4,6 @@ The published data hold pixels, states, actions and rewards, but neither physics
 imported release can be read, checked and trained on, but not repainted or regenerated. Nothing needs TensorFlow.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator
@@ -24,7 +22,8 @@ from dmcvb_gen.dataset.writer import begin, finish, put_shard, write_provenance
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD
-from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.options import Local, Location, checked, progress_bar
+from dmcvb_gen.parallel import ProgressCallback
 from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
 from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
@@ -70,34 +69,36 @@ class _Source:
         return {"files": len(files), "names": sha256_bytes("\n".join(files).encode()), "features": features}
 
 
+@checked
 def import_tfds(
-    folder: str | Path,
-    out: str | Path,
+    folder: Location,
+    out: Local,
     *,
     task: str | None = None,
     level: str | None = None,
     setting: str | None = None,
     name: str = "dmc-vb-original",
     partial: bool = False,
-    progress: ProgressCallback = ignore,
+    progress: bool = True,
 ) -> Release:
     """Import subsets of locomotion and of mazes. Run again, it resumes.
 
     Episodes are numbered by the order of their files, so a release of other files is another one.
 
     Args:
-      folder: a TFDS folder (with features.json), or a tree of DMC-VB's folders that hold such (see `parse_folder`).
-      out: folder of the new release.
-      task, level, setting: content of a single folder, if its path does not say it.
-      name: name of the new release.
-      partial: take the files that are there, though their names say that there are more (`-00003-of-00100`).
-      progress: called with 1 for each episode.
+      folder (FOLDER): A TFDS folder (with features.json), or a tree of DMC-VB's folders that hold such.
+      out (FOLDER): Folder of the new release.
+      task: Task of a folder whose path does not name it.
+      level: Level of such a folder.
+      setting: Setting of such a folder: none, static_medium, dynamic_medium, ...
+      name: Name of the new release.
+      partial: Import the files found, even if some are missing.
 
     Raises:
-      StoreError: no TFDS folder is there, it is damaged, lacks files or has other features, or `out` cannot be used.
+      StoreError: there is no TFDS folder, it is damaged, lacks files or has other features, or `out` cannot be used.
     """
-    folder, out = Path(folder), local_path(out)
-    found = sorted(path.parent for path in folder.rglob("features.json"))
+    target = local_path(out)
+    found = sorted(path.parent for path in Path(folder).rglob("features.json"))
     if not found:
         raise StoreError(f"{folder} holds no TFDS folder (no features.json); give the folder of a data set")
     if len(found) > 1 and (task or level or setting):
@@ -108,7 +109,7 @@ def import_tfds(
         for path in found:
             _refuse_missing(path)
     sources = _sources(found, task, level, setting)
-    store, layers = open_store(out), [_layers(source) for source in sources]
+    store, layers = open_store(target), [_layers(source) for source in sources]
     records = [
         source.record.model_copy(update={"layers": tuple(layer.name for layer in own)})
         for source, own in zip(sources, layers, strict=True)
@@ -124,9 +125,10 @@ def import_tfds(
     )
     begin(store, resolved, {})
     write_provenance(store, "import")
-    expect(progress, sum(record.episodes for record in records))
-    for source, own in zip(sources, layers, strict=True):
-        _import_subset(source, own, store, progress)
+    with progress_bar(progress, " episodes", scaled=False) as bar:
+        bar.expect(sum(record.episodes for record in records))
+        for source, own in zip(sources, layers, strict=True):
+            _import_subset(source, own, store, bar)
     return finish(store)
 
 

@@ -4,8 +4,6 @@ The file holds everything: pictures as WebP sheets, curves as 16-bit integers, a
 that the release does not store are painted while the file is written.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io
@@ -16,9 +14,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
 from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
@@ -28,19 +27,17 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
-from dmcvb_gen.loaders.sampler import check_count
-from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.options import Count, Local, Location, Names, checked, progress_bar
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import is_url, local_path
 from dmcvb_gen.storage.places import shown as shown_place
 from dmcvb_gen.storage.store import open_store
+from dmcvb_gen.text import as_names
 
 VIEWER = "preview/viewer.html"
 """Default place in the release."""
 EPISODES = 12
 """Episodes in a file by default, shared out among the subsets."""
-MAX_BYTES = 20_000_000
-"""Largest file. If all pictures do not fit, the viewer shows every second one, or every third, and says so."""
 SHEET_SIDE = 4096
 """Largest width and height of a sheet of pictures, in pixels."""
 WEBP_QUALITY = 85
@@ -66,42 +63,39 @@ class Written:
     stride: int
 
 
+@checked
 def view(
-    path: str,
-    out: str | Path | None = None,
+    path: Location,
+    out: Local | None = None,
     *,
-    only: Sequence[str] = (),
-    episodes: int | None = None,
-    size: int | None = None,
-    max_bytes: int = MAX_BYTES,
-    storage_options: dict | None = None,
-    progress: ProgressCallback = ignore,
+    only: Names = (),
+    episodes: Count | None = None,
+    size: Annotated[int, Ge(8), Le(1024)] | None = None,
+    max_mb: Annotated[float, Gt(0), Lt(math.inf)] = 20.0,
+    storage_options: dict[str, Any] | None = None,
+    progress: bool = True,
 ) -> Written:
-    """Write one HTML file that plays episodes of a release: pictures, rewards, actions, states and labels.
+    """Write one HTML file that plays episodes of a release: images, rewards, actions, states and labels.
 
     Args:
-      path: the release, a folder or a URL.
-      out: the file; `<release>/preview/viewer.html` by default.
-      only: subset patterns.
-      episodes: the first so many of each subset; by default 12 are shared out, at least one a subset.
-      size: paint the pictures at so many pixels a side, instead of taking the stored ones.
-      max_bytes: largest file; pictures are left out evenly until it is small enough.
-      storage_options: passed to fsspec for a URL.
-      progress: called with 1 for each episode.
+      path (RELEASE|URL): Folder or URL of the release.
+      out (FILE): The file. [default: RELEASE/preview/viewer.html]
+      only (PATTERN): Show only these subsets.
+      episodes: Episodes of each subset. [default: 12 in all]
+      size: Render the images at this size instead of the stored one.
+      max_mb: Largest file; images are left out evenly until it is small enough.
+      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
 
     Raises:
-      StoreError: the release has no episodes yet, its pictures cannot be painted, or the file cannot be written.
-      DmcvbError: `episodes` or `max_bytes` is no whole number, or below 1.
+      StoreError: the release has no episodes yet, its images cannot be rendered, or the file cannot be written.
       UnknownNameError: no such subset.
     """
+    path = str(path)
     if not out and is_url(path):
         raise StoreError(f"{shown_place(path)} is a URL: say with --out where to write the file")
-    for name, value in {"episodes": episodes, "max_bytes": max_bytes}.items():
-        if value is not None:
-            check_count(name, value)
     target = local_path(out) if out else None
     release = open_for_reading(path, storage_options)
-    names = [name for name in release.select(list(only)) if name in release]
+    names = [name for name in release.select(as_names(only)) if name in release]
     if not names:
         raise StoreError(f"{shown_place(path)} has no finished episodes; run the rollout first")
     imported = [name for name in names if release[name].record.imported]
@@ -110,12 +104,13 @@ def view(
     release = _with_pictures(release, size)
     each = episodes or max(1, EPISODES // len(names))
     chosen = [(release[name], int(index)) for name in names for index in release[name].episodes[:each]]
-    expect(progress, len(chosen))
     parts = []
-    for subset, index in chosen:
-        parts.append(_episode(subset, index, _command(release, path, subset, index)))
-        progress(1)
-    page, stride = _fitted(release, parts, max_bytes)
+    with progress_bar(progress, " episodes", scaled=False) as bar:
+        bar.expect(len(chosen))
+        for subset, index in chosen:
+            parts.append(_episode(subset, index, _command(release, path, subset, index)))
+            bar(1)
+    page, stride = _fitted(release, parts, int(max_mb * 1e6))
     if target is None:
         target = release.path / VIEWER
         open_store(release.path).replace(VIEWER, page)  # which writes through no link

@@ -139,12 +139,12 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
 def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(small_release, maze_release, tmp_path):
     for folder in (small_release, maze_release):
         whole = view(str(folder), tmp_path / "whole.html", episodes=1, size=16)
-        small = view(str(folder), tmp_path / "small.html", episodes=1, max_bytes=whole.bytes * 3 // 4)
-        assert whole.stride == 1 and small.stride > 1 and small.bytes <= whole.bytes * 3 // 4
+        small = view(str(folder), tmp_path / "small.html", episodes=1, max_mb=whole.bytes * 3 / 4e6)
+        assert whole.stride == 1 and small.stride > 1 and small.bytes <= whole.bytes * 3 / 4
         with pytest.raises(StoreError, match="do not fit"):
-            view(str(folder), tmp_path / "none.html", max_bytes=1000)
-    for option in (dict(max_bytes=0), dict(episodes=0), dict(episodes=-1), dict(episodes=1.5)):
-        with pytest.raises(DmcvbError, match=f"{next(iter(option))} is .*; give a whole number of at least 1"):
+            view(str(folder), tmp_path / "none.html", max_mb=0.001)
+    for option in (dict(max_mb=0), dict(episodes=0), dict(episodes=-1), dict(episodes=1.5)):
+        with pytest.raises(DmcvbError, match=f"^{next(iter(option))} is .*: input should be "):
             view(str(small_release), tmp_path / "none.html", **option)
 
 
