@@ -6,6 +6,7 @@ import json
 
 import datasets
 import numpy as np
+import pandas
 import pyarrow.parquet as pq
 import pytest
 
@@ -54,12 +55,19 @@ def test_an_episode_is_a_row_group_and_statistics_have_quantiles(exported, store
     assert len(state["names"]) == state["shape"][0] == 167 and state["names"][1] == "target_position.0"
     assert len(info["features"]["action"]["names"]) == 8 and info["video_path"] is None
     rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    ends = np.cumsum([length for length, _, _ in episodes])
+    assert [row["dataset_to_index"] for row in rows] == ends.tolist() and rows[1]["dataset_from_index"] == ends[0]
+    tasks = pandas.read_parquet(folder / "meta/tasks.parquet")
+    assert tasks.loc["ant-maze-tiny:****/*..*/**** (random)"].task_index == 0
+    actions = np.concatenate([values["action"] for _, values, _ in episodes])
+    total = json.loads((folder / "meta/stats.json").read_text())
+    np.testing.assert_allclose(total["action"]["std"], actions.std(axis=0), rtol=1e-4)
     for (length, values, _), row in zip(episodes, rows, strict=True):
         found = row["stats/action/q10"]
         np.testing.assert_allclose(found, np.quantile(values["action"].astype(np.float64), 0.1, axis=0), rtol=1e-6)
         top = values["pixels"][:length, 0].reshape(-1, 3) / 255
         np.testing.assert_allclose(np.ravel(row["stats/observation.images.top/q99"]), np.quantile(top, 0.99, axis=0))
-    assert {"q01", "q10", "q50", "q90", "q99"} <= set(json.loads((folder / "meta/stats.json").read_text())["action"])
+    assert {"q01", "q10", "q50", "q90", "q99"} <= set(total["action"])
 
 
 def test_several_subsets_become_the_tasks_of_one_data_set(stored, tmp_path):

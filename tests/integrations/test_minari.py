@@ -54,6 +54,7 @@ def test_environments_are_recovered_with_the_spaces_of_the_data(datasets, stored
             env = dataset.recover_environment(eval_env=evaluation)
             assert env.observation_space == dataset.observation_space, name
             assert env.action_space == dataset.action_space
+            assert env.spec.id.startswith(f"dmcvb_gen/{name.split('-')[0]}-") and env.spec.id.endswith("-v0")
             assert env.unwrapped._stage.split == split
             assert env.unwrapped._stage.max_steps == stored[name].max_steps
             assert env.unwrapped._stage.pictures.hide_goal == name.endswith(("hidden", "fixed"))

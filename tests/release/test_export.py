@@ -93,49 +93,6 @@ def test_the_replay_buffer_has_diffusion_policys_layout(exported, episodes):
     np.testing.assert_array_equal(root["data/state"][:500], episodes[0]["state"][:500])
 
 
-def test_minari_opens_its_dataset_and_the_environment(exported, episodes):
-    minari = pytest.importorskip("minari")
-    dataset = minari.MinariDataset(exported("minari") / "data")
-    assert dataset.total_episodes == 2 and dataset.total_steps == 1000
-    assert dataset.id == "dmcvb_gen/walker-walk/random-static-v0"
-    for episode, ours in zip(dataset.iterate_episodes(), episodes, strict=False):
-        np.testing.assert_array_equal(episode.observations["pixels"], ours["pixels"])
-        np.testing.assert_array_equal(episode.observations["state"], ours["state"])
-        np.testing.assert_array_equal(episode.actions, ours["action"])
-        np.testing.assert_array_equal(episode.rewards, ours["reward"])
-        assert episode.truncations[-1] and episode.truncations.sum() == 1 and not episode.terminations.any()
-    env = dataset.recover_environment()
-    assert env.observation_space == dataset.observation_space and env.action_space == dataset.action_space
-    assert env.spec.id == "dmcvb_gen/walker-walk-static-v0"
-    env.close()
-
-
-def test_lerobot_tables_are_complete_and_its_pictures_lossless(exported, episodes):
-    pq = pytest.importorskip("pyarrow.parquet")
-    pandas = pytest.importorskip("pandas")
-    folder = exported("lerobot")
-    info = json.loads((folder / "meta/info.json").read_text())
-    assert info["codebase_version"] == "v3.0" and info["total_frames"] == 1000 and info["fps"] == 20
-    path = folder / info["data_path"].format(chunk_index=0, file_index=0)
-    table = pq.read_table(path)
-    assert set(table.column_names) == set(info["features"]) and table.num_rows == 1000
-    row = table.slice(750, 1).to_pylist()[0]
-    picture = np.asarray(Image.open(io.BytesIO(row["observation.image"]["bytes"])))
-    np.testing.assert_array_equal(picture, episodes[1]["pixels"][250])
-    np.testing.assert_array_equal(np.float32(row["action"]), episodes[1]["action"][250])
-    assert (row["episode_index"], row["frame_index"], row["index"]) == (1, 250, 750)
-    assert row["timestamp"] == pytest.approx(250 / 20)
-    assert table["next.done"].to_pylist().index(True) == 499
-    tasks = pandas.read_parquet(folder / "meta/tasks.parquet")
-    assert tasks.loc["walker-walk (random)"].task_index == 0
-    rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert [(r["dataset_from_index"], r["dataset_to_index"]) for r in rows] == [(0, 500), (500, 1000)]
-    statistics = json.loads((folder / "meta/stats.json").read_text())
-    actions = np.concatenate([episodes[0]["action"], episodes[1]["action"]])
-    np.testing.assert_allclose(statistics["action"]["std"], actions.std(axis=0), rtol=1e-4)
-    assert np.shape(statistics["observation.image"]["mean"]) == (3, 1, 1)
-
-
 def example_class():
     """tf.train.Example, built from its published definition with Google's protocol buffer library."""
     descriptor_pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")

@@ -76,16 +76,6 @@ def test_an_imported_release_keeps_its_pictures(imported, tmp_path):
         dmcvb_gen.open(str(imported), paint=True)
 
 
-@pytest.mark.parametrize("family", ["locomotion", "mazes"])
-def test_an_imported_release_is_exported_to_lerobot(imported, dmcvb_mazes, tmp_path, family):
-    folder = imported
-    if family == "mazes":
-        import_tfds(dmcvb_mazes, folder := tmp_path / "r")
-    for out in export(str(folder), "lerobot", tmp_path / "out"):
-        info = json.loads((out / "meta/info.json").read_text())
-        assert info["fps"] == 20
-
-
 def check_imported_card(folder):
     """Its card is written, fits, and claims nothing that it has not."""
     write_card(folder)
