@@ -34,15 +34,20 @@ def write(source: Source, folder: Path) -> None:
     group.create_array("episode", data=np.array(source.episodes), dimension_names=("episode",))
     arrays = {}
     for name in subset.arrays:
-        stored = subset.array(name)
-        chunking: dict[str, Any] = stored.chunking
+        stored, spec = subset.array(name), subset.spec(name)
+        chunking: dict[str, Any] = {"chunks": (together, *spec.shape)}
+        if spec.steps:
+            rows = stored.shape[1]
+            steps = min(spec.chunk_steps or rows, rows)
+            chunking = {"chunks": (1, steps, *spec.shape)}
+            chunking |= {"shards": (together, -(-rows // steps) * steps, *spec.shape)}
         arrays[name] = group.create_array(
             name.replace("/", "_"),
             shape=(count, *stored.shape[1:]),
             dtype=stored.dtype,
             **chunking,
             dimension_names=stored.dimensions,
-            attributes=stored.attributes | ({"names": source.names[name]} if name in source.names else {}),
+            attributes=spec.attributes | ({"names": source.names[name]} if name in source.names else {}),
             fill_value=0,
         )
     for first in range(0, count, together):
