@@ -134,7 +134,7 @@ def _find_split(root: Path, split: str) -> list[tuple[str, tuple[Path, ...]]]:
         if name in folders:
             return _find_videos(root / name)
     if folders:
-        raise BackgroundError(f"{root} has no {' or '.join(_SPLITS[split])} folder beside its other split")
+        raise BackgroundError(f"{root} has no {' or '.join(_SPLITS[split])} folder, only its other split")
     videos = _find_videos(root)
     if len(videos) == 1:
         return videos

@@ -43,7 +43,7 @@ def default_renderer(task: Task) -> str:
     if not is_own(task.id):
         return NATIVE
     if reason := OpenglRenderer.unavailable():
-        _log.warning("%s is rendered by native, and nobody compared it with MuJoCo's own renderer: %s", name, reason)
+        _log.warning("%s is rendered by native, without a comparison with MuJoCo's own renderer: %s", name, reason)
         return NATIVE
     mean, block = disagreement(task)
     if mean <= LARGEST_MEAN and block <= LARGEST_BLOCK:

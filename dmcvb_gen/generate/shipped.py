@@ -79,7 +79,7 @@ def load_shipped(source: str | Path) -> Shipped:
         return Shipped(Manifest.model_validate(content["manifest"]), recipes, records)
     except (lzma.LZMAError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise StoreError(f"{source} is no archive of a manifest, or damaged ({reason}); take it again") from None
+        raise StoreError(f"{source} is no archive of a manifest, or damaged ({reason}); download it again") from None
 
 
 def pack(release: Release, out: str | Path) -> int:

@@ -108,8 +108,8 @@ def check_weights(path: Path, header: PolicyHeader, weights: Mapping[str, np.nda
         shape = weights[name].shape if name in weights else None
         if shape != wanted.get(name):
             raise PolicyFileError(
-                f"{path}: weight {name!r} has shape {shape}, the layers beside it ask for {wanted.get(name)}; save it "
-                "whole again"
+                f"{path}: weight {name!r} has shape {shape}, its neighboring layers need {wanted.get(name)}; save "
+                "it whole"
             )
     for name, value in weights.items():
         if value.dtype != np.float32 or not np.isfinite(value).all():

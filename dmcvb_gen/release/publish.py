@@ -103,7 +103,7 @@ def _check_complete(release: Release, root: str | Path, pixels: bool) -> None:
         )
     if not pixels and any(record.imported for record in release.manifest.subsets):
         raise StoreError(
-            f"{root} was imported, and its images cannot be rendered again; publish it with them, without --no-pixels"
+            f"{root} was imported, and its images cannot be rendered; publish it with them, without --no-pixels"
         )
 
 

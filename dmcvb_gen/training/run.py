@@ -139,7 +139,7 @@ def read_state(folder: str | Path) -> dict[str, Any] | None:
       DmcvbError: the file is damaged.
     """
     path = Path(folder) / "resume" / STATE
-    return read_state_file(path, "start again with another --out") if path.exists() else None
+    return read_state_file(path, "start over with another --out") if path.exists() else None
 
 
 def check_same(folder: Path, found: RunConfig, asked: RunConfig) -> None:

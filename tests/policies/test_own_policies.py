@@ -386,7 +386,7 @@ def damaged(name, value):
         (damaged("0.weight", float("inf")), "not finite float32; take an earlier checkpoint"),
         (
             mlp(24, 8, 6).state_dict() | {"2.weight": torch.zeros(6, 9)},
-            "has shape (6, 9), the layers beside it",
+            "has shape (6, 9), its neighboring layers",
         ),
         (mlp(24, *[2] * 17, 6).state_dict(), "hidden: Tuple should have at most 16 items"),
         (CleanRlPpo(24, 6).state_dict(), "--actions has no effect"),

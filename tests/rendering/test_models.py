@@ -222,7 +222,7 @@ def test_without_opengl_one_line_says_that_nobody_compared(tmp_path, monkeypatch
     task, _ = task_of(tmp_path, model())
     assert default_renderer(task) == "native"
     [line] = [record.getMessage() for record in caplog.records]
-    assert "nobody compared it with MuJoCo's own renderer: libEGL is missing; install libegl1" in line
+    assert "without a comparison with MuJoCo's own renderer: libEGL is missing; install libegl1" in line
     with pytest.raises(RenderingError, match="'opengl' cannot start here: libEGL is missing; install"):
         make_renderer("opengl", task, 64)
 
