@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -117,34 +116,27 @@ def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
 
 
 def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
-    """The column of the pictures."""
-    name = _pictures(subset).arrays[0]
-    without = subset.unpainted[episodes]
-    frames: dict[int, np.ndarray] = {}
-    for episode in episodes[~without] if name in subset.arrays else ():
-        frames[int(episode)] = subset.array(name)[int(episode), 0]
-    lacking = np.array([episode for episode in episodes if int(episode) not in frames], int)
+    """The column of the pictures: the stored ones, others rendered from physics states and labels."""
+    pictures = _pictures(subset)
+    name, frames = pictures.arrays[0], dict.fromkeys(episodes.tolist())
+    lacking = episodes[subset.unpainted[episodes]] if name in subset.arrays else episodes
+    for episode in np.setdiff1d(episodes, lacking).tolist():
+        frames[episode] = subset.array(name)[episode, 0]
     if len(lacking) and not subset.record.imported:
-        frames |= dict(zip(lacking.tolist(), _painted(subset, lacking), strict=True))
-    return {"first_frame": [_picture(frames.get(int(episode))) for episode in episodes]}
+        renderer, _ = renderer_for(subset.record, background_source(subset.release.path, subset.record))
+        try:
+            physics, labels = subset.read("physics", lacking)[:, 0], subset.labels(lacking)[:, 0]
+            made = renderer.render(physics, labels, views=[pictures.views[0]], hide_goal=pictures.hide_goal)[:, 0]
+        finally:
+            renderer.close()
+        frames |= dict(zip(lacking.tolist(), made, strict=True))
+    return {"first_frame": [_picture(frame) for frame in frames.values()]}
 
 
 def _pictures(subset: Subset) -> Pictures:
     """The views that agents learn from; the overhead view if there is no other."""
     pictures = training_pictures(subset)
     return pictures if pictures.views else shown(subset)
-
-
-def _painted(subset: Subset, episodes: np.ndarray) -> Iterator[np.ndarray]:
-    """First frames, rendered from the stored physics states and labels."""
-    pictures = _pictures(subset)
-    renderer, _ = renderer_for(subset.record, background_source(subset.release.path, subset.record))
-    try:
-        physics = subset.read("physics", episodes)[:, 0]
-        labels = subset.labels(episodes)[:, 0]
-        yield from renderer.render(physics, labels, views=[pictures.views[0]], hide_goal=pictures.hide_goal)[:, 0]
-    finally:
-        renderer.close()
 
 
 def _picture(frame: np.ndarray | None) -> dict[str, Any] | None:

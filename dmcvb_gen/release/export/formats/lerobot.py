@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,12 +56,12 @@ def write(sources: Sequence[Source], folder: Path) -> None:
     for source, text in zip(sources, _task_texts(sources), strict=True):
         task = layout.tasks.index(text)
         for episode in source:
-            columns = layout.frames(episode, len(rows), index, task)
+            columns = layout.frames(episode, len(rows), index, task) | layout.pictures(episode)
             row = {"episode_index": len(rows), "tasks": [layout.tasks[task]], "length": episode.length}
             row |= {"dataset_from_index": index, "dataset_to_index": index + episode.length}
-            row |= files.add(columns, episode, len(rows))
+            row |= files.add(columns, len(rows))
             rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
-            rows[-1] |= statistics.add(columns, layout.pictures(episode), layout.gray)
+            rows[-1] |= statistics.add(columns)
             index += episode.length
     files.close()
     _write_meta(folder, layout, rows, index, statistics)
@@ -138,7 +138,7 @@ class _Layout:
       tasks: their texts; `task_index` counts them. robot: what they have in common.
       rate, fps: steps a second, and the whole number that LeRobot takes for them; timestamps are made of that.
       keys: view -> feature of its pictures.
-      modalities: array of depth, segmentation or flow -> feature of its pictures. gray: those of 16 bits.
+      modalities: array of depth, segmentation or flow -> feature of its pictures.
       features: features as in info.json.
     """
 
@@ -158,7 +158,6 @@ class _Layout:
         single = len(first.views) == 1
         self.keys = {view: "observation.image" if single else f"observation.images.{view}" for view in first.views}
         self.modalities = {name: f"observation.images.{name.replace('/', '_')}" for name in first.modalities}
-        self.gray = {key for name, key in self.modalities.items() if modality_of(name).levels}
         self.features = self._features(first)
 
     def _features(self, source: Source) -> dict[str, Any]:
@@ -245,31 +244,29 @@ class _Files:
     """The tables, `EPISODES_PER_FILE` episodes a file, a row group an episode."""
 
     def __init__(self, folder: Path, layout: _Layout):
-        self._folder, self._layout, self._schema = folder, layout, layout.schema()
+        self._folder, self._schema = folder, layout.schema()
         self._table: Any = None
 
-    def add(self, columns: dict[str, np.ndarray], episode: ExportEpisode, number: int) -> dict[str, Any]:
+    def add(self, columns: dict[str, np.ndarray], number: int) -> dict[str, Any]:
         """Write an episode; gives where it is, as columns of the table of episodes."""
         chunk, file = divmod(number // EPISODES_PER_FILE, CHUNK_FILES)
         if number % EPISODES_PER_FILE == 0:
             self.close()
             self._open(chunk, file)
-        pictures = self._layout.pictures(episode)
-        place: dict[str, Any] = {"data/chunk_index": chunk, "data/file_index": file}
-        self._table.write_table(self._rows(columns, pictures))
-        return place
+        self._table.write_table(self._rows(columns))
+        return {"data/chunk_index": chunk, "data/file_index": file}
 
-    def _rows(self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray]) -> pa.Table:
+    def _rows(self, columns: dict[str, np.ndarray]) -> pa.Table:
         import pyarrow as pa
 
         arrays = []
         for field in self._schema:
-            if field.name in pictures:
-                values = [{"bytes": png(frame), "path": None} for frame in pictures[field.name]]
-                arrays.append(pa.array(values, field.type))
+            values = columns[field.name]
+            if pa.types.is_struct(field.type):
+                arrays.append(pa.array([{"bytes": png(frame), "path": None} for frame in values], field.type))
                 continue
             many = pa.types.is_fixed_size_list(field.type)
-            flat = pa.array(columns[field.name].ravel(), field.type.value_type if many else field.type)
+            flat = pa.array(values.ravel(), field.type.value_type if many else field.type)
             arrays.append(pa.FixedSizeListArray.from_arrays(flat, field.type.list_size) if many else flat)
         return pa.table(arrays, schema=self._schema)
 
@@ -294,20 +291,18 @@ class _Statistics:
     def __init__(self):
         self._parts: dict[str, list[dict[str, np.ndarray]]] = {}
 
-    def add(
-        self, columns: dict[str, np.ndarray], pictures: dict[str, np.ndarray], gray: Collection[str]
-    ) -> dict[str, list]:
+    def add(self, columns: dict[str, np.ndarray]) -> dict[str, list]:
         """Take an episode up; gives its own statistics as columns "stats/<feature>/<statistic>".
 
-        Args:
-          gray: pictures of 16 bits, whose statistics are in their own unit; those of others lie in [0, 1].
+        Those of pictures have a number a channel: of 16 bits in their own unit, of others in [0, 1].
         """
         flat: dict[str, list] = {}
         shape: tuple[int, ...]
-        for name, value in (columns | pictures).items():
-            if name in gray:
+        for name, value in columns.items():
+            count = len(value)
+            if value.dtype == np.uint16:
                 value, shape = value.reshape(-1, 1).astype(np.float64), (1, 1, 1)
-            elif name in pictures:  # a number a channel
+            elif value.ndim == 4:
                 value, shape = value.reshape(-1, 3) / 255.0, (3, 1, 1)
             else:
                 value = np.asarray(value, np.float64).reshape(len(value), -1)
@@ -315,7 +310,7 @@ class _Statistics:
             part = {key: getattr(value, key)(axis=0).reshape(shape) for key in ("min", "max", "mean", "std")}
             found = np.quantile(value, list(QUANTILES.values()), axis=0)
             part |= {key: number.reshape(shape) for key, number in zip(QUANTILES, found, strict=True)}
-            part["count"] = np.array([len(columns["index"])])
+            part["count"] = np.array([count])
             self._parts.setdefault(name, []).append(part)
             flat |= {f"stats/{name}/{key}": number.tolist() for key, number in part.items()}
         return flat
