@@ -238,7 +238,9 @@ def test_whoever_dies_leaves_no_half_and_goes_on(act, after, tmp_path, monkeypat
             seen = Release.open(place)
             assert seen.digest in digests and not [i for i in check_files(place) if "zarr.json" not in str(i)], at
         move()
-        history = ("manifests/", "layers/")
+        named = {recipe.sha256 for recipe in Release.open(tmp_path / "new").recipes}
+        older = [f"recipes/{path.name}" for path in (tmp_path / "new/recipes").iterdir() if path.stem not in named]
+        history = ("manifests/", "layers/", *older)
         wanted = {path: data for path, data in content(tmp_path / "new").items() if not path.startswith(history)}
         there = content(place)
         assert {path: there.get(path) for path in wanted} == wanted and not check_files(place), at
