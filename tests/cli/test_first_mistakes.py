@@ -257,7 +257,7 @@ def test_mistakes_in_what_is_validated_are_told_before_any_work(small_release, t
     for words, told in (
         (["--benchmark", "b9"], "unknown benchmark 'b9'"),
         (["--benchmark", "b3"], "has no data"),
-        (["--agent", "nowhere:x"], "cannot load agent nowhere:x"),
+        (["--agent", "nowhere:x"], "cannot find agent nowhere:x"),
         (["--only", "foo*"], "unknown subset pattern 'foo*'"),
     ):
         assert told in run("validate", small_release, *words, "--out", tmp_path / "out", code=2)
