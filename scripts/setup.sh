@@ -9,13 +9,13 @@ extras="${extras:-train}"
 ready="$venv/.ready-$extras"
 if [ ! -e "$ready" ] || [ pyproject.toml -nt "$ready" ] || [ scripts/constraints.txt -nt "$ready" ]; then
   "${PYTHON:-python3}" -m venv "$venv"
-  "$venv/bin/python" -m pip install --quiet --upgrade "pip>=24"
+  "$venv/bin/python" -m pip install --quiet --quiet --upgrade "pip>=24"
   if ! "$venv/bin/python" -c "import torch" 2>/dev/null; then
     echo "installing torch ..."
-    "$venv/bin/python" -m pip install --quiet --constraint scripts/constraints.txt torch
+    "$venv/bin/python" -m pip install --quiet --quiet --constraint scripts/constraints.txt torch
   fi
   echo "installing dmcvb-gen[$extras] ..."
-  "$venv/bin/python" -m pip install --quiet --constraint scripts/constraints.txt --editable ".[$extras]"
+  "$venv/bin/python" -m pip install --quiet --quiet --constraint scripts/constraints.txt --editable ".[$extras]"
   touch "$ready"
 fi
 . "$venv/bin/activate"
