@@ -5,8 +5,10 @@ pydantic checks them. `Annotated` adds what a type alone does not say: bounds, o
 
 from __future__ import annotations
 
+import contextvars
 import functools
 import inspect
+import re
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -44,6 +46,26 @@ GoalPictures = Literal["visible", "hidden"]
 Precision = Literal["auto", "float32", "bfloat16"]
 Split = Literal["train", "val"]
 
+at_terminal = contextvars.ContextVar("at_terminal", default=False)
+"""Whether a command runs, whose messages name flags; messages of functions name their parameters."""
+_FLAG = re.compile(r"`[^`]*`|dmcvb-gen [^;,(]*|--(?P<name>[a-z][a-z-]*)")
+_PARAMETERS = {
+    "agent": "agents",
+    "all": "everything",
+    "benchmark": "benchmarks",
+    "distractor": "distractors",
+    "executor": "workers",
+    "goal": "goals",
+    "label": "labels",
+    "level": "levels",
+    "no-pixels": "pixels=False",
+    "option": "storage_options",
+    "range": "episode_range",
+    "ray-address": "workers",
+    "set": "settings",
+}
+"""Flags whose parameters have other names."""
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -52,7 +74,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     """Decorator: a function takes what pydantic makes of its arguments by their types.
 
     Raises:
-      DmcvbError: at a call, in one line, a value that its type does not allow.
+      DmcvbError: at a call, in one line, a value that its type does not allow. Messages of what it calls name the
+        function's parameters in place of its command's flags, unless the command runs.
     """
     signature = inspect.signature(function)
 
@@ -61,9 +84,24 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
             given.arguments[name] = _checked(name, value, signature.parameters[name].annotation)
-        return function(*given.args, **given.kwargs)
+        try:
+            return function(*given.args, **given.kwargs)
+        except DmcvbError as error:
+            if not at_terminal.get():
+                error.args = (with_parameters(str(error)), *error.args[1:])
+            raise
 
     return call
+
+
+def with_parameters(message: str) -> str:
+    """A message with the names of parameters in place of flags; commands in it stay as they are."""
+
+    def renamed(found: re.Match[str]) -> str:
+        name = found["name"]
+        return found[0] if name is None else _PARAMETERS.get(name, name.replace("-", "_"))
+
+    return _FLAG.sub(renamed, message)
 
 
 def _checked(name: str, value: Any, annotation: Any) -> Any:

@@ -18,6 +18,7 @@ import click
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
+from dmcvb_gen.options import at_terminal
 from dmcvb_gen.text import printable
 from dmcvb_gen.version import __version__
 
@@ -100,6 +101,7 @@ class LazyGroup(click.Group):
     def invoke(self, ctx):
         _asked_to_stop.clear()
         _name_glfw_library()
+        named = at_terminal.set(True)
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -116,6 +118,8 @@ class LazyGroup(click.Group):
                 raise
             click.echo(f"error: {printable(what)}", err=True)
             ctx.exit(2)
+        finally:
+            at_terminal.reset(named)
 
 
 @click.group("dmcvb-gen", cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

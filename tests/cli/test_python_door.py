@@ -16,6 +16,7 @@ from dmcvb_gen.benchmarks.report import make_budget
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.options import with_parameters
 
 FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "fetch", "export", "validate")
 FUNCTIONS += ("train_behaviour", "evaluate_behaviour")
@@ -172,8 +173,8 @@ def two_rings(folder):
         (lambda out: dmcvb_gen.verify(out, everything=True), "always read whole"),
         (lambda out: dmcvb_gen.fetch("file:/nowhere", out, size=32), "paint=True"),
         (lambda out: dmcvb_gen.export(out, "hdf5", out / "x"), "no release"),
-        (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), "--checks-only trains nothing"),
-        (lambda out: dmcvb_gen.validate(out, checks_only=True, profile="paper"), "--profile has no effect"),
+        (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), "^checks_only trains nothing"),
+        (lambda out: dmcvb_gen.validate(out, checks_only=True, profile="paper"), "^profile has no effect"),
         (lambda out: dmcvb_gen.validate(out, agents="bc,state-bc"), "no release"),
         (lambda out: dmcvb_gen.validate(out, scale=float("inf")), "^scale is inf: input should be "),
         (
@@ -210,9 +211,26 @@ def two_rings(folder):
     ],
 )
 def test_errors_are_those_of_the_commands(call, message, tmp_path):
-    with pytest.raises(DmcvbError, match=message):
+    with pytest.raises(DmcvbError, match=message) as caught:
         call(tmp_path / "out")
+    assert " --" not in re.sub("`[^`]*`|dmcvb-gen [^;,]*", "", f" {caught.value}"), "a flag, which Python has not"
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "message, named",
+    [
+        ("choose another --out, or fewer --episodes", "choose another out, or fewer episodes"),
+        ("select with --only and --range", "select with only and episode_range"),
+        ("see `info --json`; add --checks-only", "see `info --json`; add checks_only"),
+        (
+            "run dmcvb-gen fetch URL --out FOLDER; or leave --paint",
+            "run dmcvb-gen fetch URL --out FOLDER; or leave paint",
+        ),
+    ],
+)
+def test_messages_of_functions_name_parameters(message, named):
+    assert with_parameters(message) == named
 
 
 def test_arguments_may_be_paths_numpys_numbers_and_iterators(tmp_path):
