@@ -111,11 +111,11 @@ def test_a_task_without_lamps_has_no_light_to_vary():
 
 
 SENTENCES = {
-    "static_0.35": "s = 0.35",
-    "dynamic_camera0.5-background3": "up to 3 videos",
-    "dynamic_camera0.2-color0.2-background8-cue0.8": "(correlation 0.8)",
-    "dynamic_color0.2-light0.5": "lamps walk within",
-    "dynamic_shake0.5": "the model's own",
+    "static_0.35": "camera: s = 0.35, color: s = 0.35, background: all videos |",
+    "dynamic_camera0.5-background3": "camera: s = 0.5, background: up to 3 videos |",
+    "dynamic_camera0.2-color0.2-background8-cue0.8": "background: up to 8 videos, cue: correlation 0.8 |",
+    "dynamic_color0.2-light0.5": "color: s = 0.2, light: s = 0.5 |",
+    "dynamic_shake0.5": "| shake: s = 0.5 |",
 }
 """Setting -> what the card says of it."""
 

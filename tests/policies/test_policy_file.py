@@ -177,7 +177,7 @@ def test_a_small_file_that_asks_for_huge_layers_is_refused_at_once(tmp_path):
     header = json.loads(header_of(hidden=[65_536] * 16).model_dump_json())
     save_file({"mean.bias": torch.zeros(6)}, path, metadata={"header": json.dumps(header)})
     tracemalloc.start()
-    with pytest.raises(PolicyFileError, match="ask for"):
+    with pytest.raises(PolicyFileError, match="has shape None"):
         load_policy(path)
     assert tracemalloc.get_traced_memory()[1] < 2**20
     tracemalloc.stop()
