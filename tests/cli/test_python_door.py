@@ -173,7 +173,7 @@ def two_rings(folder):
         (lambda out: dmcvb_gen.verify(out, everything=True), "always read whole"),
         (lambda out: dmcvb_gen.fetch("file:/nowhere", out, size=32), "paint=True"),
         (lambda out: dmcvb_gen.export(out, "hdf5", out / "x"), "no release"),
-        (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), "^checks_only trains nothing"),
+        (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), ": checks_only trains nothing"),
         (lambda out: dmcvb_gen.validate(out, checks_only=True, profile="paper"), "^profile has no effect"),
         (lambda out: dmcvb_gen.validate(out, agents="bc,state-bc"), "no release"),
         (lambda out: dmcvb_gen.validate(out, scale=float("inf")), "^scale is inf: input should be "),
