@@ -81,7 +81,7 @@ def test_several_subsets_become_the_tasks_of_one_data_set(stored, tmp_path):
     np.testing.assert_array_equal(table["index"], np.arange(sum(lengths)))
     rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [row["tasks"][0].rpartition("(")[2] for row in rows] == ["random, fixed)"] * 2 + ["random, hidden)"] * 2
-    with pytest.raises(DmcvbError, match="--merge is not for npz; it is for lerobot"):
+    with pytest.raises(DmcvbError, match="merge is not for npz; it is for lerobot"):
         export(release, "npz", tmp_path / "x", merge=True)
 
 

@@ -104,7 +104,7 @@ def test_damaged_or_foreign_folders_are_not_imported(rlds, tmp_path):
     with pytest.raises(StoreError, match="no features.json"):
         import_tfds(tmp_path, tmp_path / "r")
     shutil.copytree(rlds, tmp_path / "somewhere")
-    with pytest.raises(StoreError, match="--task"):
+    with pytest.raises(StoreError, match="task, level"):
         import_tfds(tmp_path / "somewhere", tmp_path / "r")
     [path] = (tmp_path / "somewhere").rglob("*.tfrecord-*")
     data = path.read_bytes()

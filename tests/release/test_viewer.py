@@ -157,7 +157,7 @@ def test_the_command_writes_and_refuses(small_release, tmp_path):
     assert episode["views"][0]["width"] == 24 and "--range 0:1" in data
     with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
         view(str(small_release), only=["cheetah-run"])
-    with pytest.raises(StoreError, match="--out"):
+    with pytest.raises(StoreError, match="say with out where"):
         view("s3://bucket/release")
 
 

@@ -79,7 +79,7 @@ def test_it_finds_the_action_that_pays():
     assert (torch.tanh(mean)[:, 0] - 0.5).abs().mean() < 0.1 and std[:, 0].mean() < 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_policy_keeps_to_its_bounds_between_targets():
     bounds = dict(epsilon_mean=1e-3, epsilon_std=1e-3, dual_learning_rate=0.1)
     mpo_learner = learner(target_period=10_000, learning_rate=3e-3, **bounds)

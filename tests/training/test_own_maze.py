@@ -43,7 +43,7 @@ def quick_selection(monkeypatch):
     monkeypatch.setattr(selection, "MEDIUM_TOLERANCE", 0.6)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, quick_selection):
     (in_folder / "ring.txt").write_text(HALL)
     commands = documented_commands()

@@ -288,7 +288,7 @@ def test_a_finished_run_that_went_a_few_steps_too_far_resumes_to_what_it_is(tmp_
         again = train_behaviour(out=tmp_path / "run", resume=True, steps=steps, progress=False)
         assert again.steps == end
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run" / "checkpoints").iterdir()}
-    with pytest.raises(DmcvbError, match="at step 92, past --steps 60; give more"):
+    with pytest.raises(DmcvbError, match="at step 92, past steps 60; give more"):
         train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=60, progress=False)
 
 
