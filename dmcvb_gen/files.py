@@ -1,7 +1,7 @@
 """Write files atomically: bytes, text or JSON become a whole file, flushed to the disk, or none.
 
 A file in the making has a name of its own that ends in `PARTIAL`, beside the one that it becomes, so writers never
-disturb each other. Its writer holds a lock on it, which the system frees when the process ends: what nobody locks was
+disturb each other. Its writer holds a lock on it, which the system frees when the process ends: an unlocked one was
 left by a killed process.
 """
 
@@ -30,7 +30,7 @@ PARTIAL = ".partial"
 LASTING = (errno.EEXIST, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.EIO)
 """Errors that another way of writing would meet, too."""
 LARGEST_YAML = 100_000
-"""Bytes of a file that somebody wrote by hand; PyYAML, which is not fast, takes seconds for it at worst."""
+"""Bytes of a file that a person wrote by hand; PyYAML, which is not fast, takes seconds for it at worst."""
 
 
 @contextlib.contextmanager
@@ -220,7 +220,7 @@ def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
 
 
 def remove_partial(folder: str | Path) -> None:
-    """Delete what killed processes left in the making right in a folder; what somebody is making stays."""
+    """Delete what killed processes left in the making right in a folder; files with a lock stay."""
     for path in Path(folder).glob(f".*{PARTIAL}"):
         with contextlib.suppress(OSError), _opened(path) as handle:  # a link, or gone by now
             if not _lock(handle):

@@ -98,6 +98,6 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
         raise DmcvbError(
             f"cannot find {kind} {name} ({error}); give <module>:<function>, run from its folder"
         ) from None
-    except Exception as error:  # the code of somebody else
+    except Exception as error:  # the user's code
         reason = (str(error).splitlines() or [""])[0]
         raise DmcvbError(f"{kind} {name} cannot be imported ({type(error).__name__}: {reason})") from error

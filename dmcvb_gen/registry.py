@@ -57,7 +57,7 @@ class Registry(Generic[Thing]):
             for entry in metadata.entry_points(group=self.group):
                 try:
                     entry.load()
-                except Exception as error:  # a broken package of somebody else must not stop all others
+                except Exception as error:  # one broken package must not stop all others
                     _log.warning("%s %s (%s) cannot be loaded: %s", self.kind, entry.name, entry.value, error)
         return self._things
 

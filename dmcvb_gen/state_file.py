@@ -1,6 +1,6 @@
 """The files that trainings resume from, of policies and of agents: nested tensors, numbers and texts.
 
-A folder may come from somebody else (`--init-from`, `--resume`), so a state is read as data: tensors by number, and a
+A folder may come from another person (`--init-from`, `--resume`), so a state is read as data: tensors by number, and a
 JSON tree that says where each belongs. Nothing in such a file can run.
 """
 

@@ -35,7 +35,7 @@ def format_bytes(count: float) -> str:
 
 
 def printable(text: str, line: str = "\n") -> str:
-    """A text of somebody else as a terminal may print it: control characters, which it would obey, become "?".
+    """A text from another person as a terminal may print it: control characters, which it would obey, become "?".
 
     Args:
       line: what a line break becomes.

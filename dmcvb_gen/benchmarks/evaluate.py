@@ -476,7 +476,7 @@ class TrainedAgent:
     Attributes:
       agent: what it is, e.g. "id+bc" by its name. sizes: sizes of its observations and actions.
       policy, normalization: its networks, and the normalization of the states that it learned from.
-      evaluation: what `protocol` says of the evaluation that belongs to its data; {} if nobody knows.
+      evaluation: what `protocol` says of the evaluation that belongs to its data; {} if it is not known.
     """
 
     agent: Agent

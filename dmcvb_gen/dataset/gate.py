@@ -146,7 +146,7 @@ class Release:
 
     @classmethod
     def in_making(cls, store: Store) -> Self:
-        """Open what recipes ask for, as far as it is made; for whoever goes on with it.
+        """Open what recipes ask for, as far as it is made; for the process that goes on with it.
 
         Raises:
           StoreError: there is no recipe, or recipes contradict one another.

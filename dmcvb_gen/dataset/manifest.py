@@ -8,7 +8,7 @@
     manifest.json                Manifest     subsets, and layers with the SHA-256 of their lists
 
 A digest of a release is the SHA-256 of its manifest's bytes; from there, every file has its SHA-256. The manifest is a
-function of recipes and records (`build_manifest`), so whoever finishes a release writes the same bytes.
+function of recipes and records (`build_manifest`), so every process that finishes a release writes the same bytes.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class HasRecord(Protocol):
 
 @dataclass(frozen=True)
 class Pictures:
-    """The pictures of a subset that somebody may look at.
+    """The pictures of a subset that people may look at.
 
     Attributes:
       views: views in the task's order; ("pixels",) for a task with one.

@@ -80,7 +80,7 @@ class ShardOutcome:
 
     Attributes:
       episodes: (first, last + 1).
-      was: what was wrong with its files, in words; None if nothing was, or nobody looked.
+      was: what was wrong with its files, in words; None if nothing was, or the files were not read.
       equal: whether the bytes made are the recorded ones; None if no record was there.
       repaired: True if files were put back.
       differences: of the arrays whose bytes differ; "largest" is None if the released values cannot be read.

@@ -38,7 +38,7 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
     Args:
       tasks: names, or text files of mazes; with a recipe, those that are taken of it.
       recipe: a YAML file or the name of a shipped recipe.
-      given: options of `RECIPE_OPTIONS` that somebody gave, and no defaults.
+      given: options of `RECIPE_OPTIONS` that were given, without defaults.
 
     Raises:
       DmcvbError: an unknown name, a value that is wrong, or an option that would have no effect.

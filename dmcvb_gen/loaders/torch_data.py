@@ -32,7 +32,7 @@ class _OfEpoch:
 
     def __init__(self, subset: Subset, epoch: int | None = None):
         self.subset = subset
-        self._epoch = torch.tensor(-1 if epoch is None else epoch).share_memory_()  # -1: nobody has given one
+        self._epoch = torch.tensor(-1 if epoch is None else epoch).share_memory_()  # -1: none was given
 
     @property
     def epoch(self) -> int:

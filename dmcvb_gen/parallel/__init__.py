@@ -80,7 +80,7 @@ def open_pool(
 
 
 def in_order(function: Callable, items: Sequence, workers: Workers | Pool = 1, tick: ProgressCallback = ignore) -> list:
-    """`function(item, tick=...)` of all items, in their order, whoever had them first.
+    """`function(item, tick=...)` of all items, in their order.
 
     Args:
       workers: or an open pool, which stays open, with the tick that it has.

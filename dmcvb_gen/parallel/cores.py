@@ -12,7 +12,7 @@ from dmcvb_gen.parallel.memory import CONTAINER, free_memory
 
 
 def default_workers(pieces: int, memory: int = 0) -> int:
-    """Workers if nobody says how many: a core each, as far as there is work and memory for them; at least 1.
+    """The default number of workers: a core each, as far as there is work and memory for them; at least 1.
 
     Args:
       pieces: pieces of work. memory: bytes that a worker needs; 0 if it needs little.

@@ -31,7 +31,7 @@ class RayPool(Pool):
       threads: threads of the libraries that a piece of work uses.
 
     Raises:
-      DmcvbError: ray is not installed, or nobody answers at the address.
+      DmcvbError: ray is not installed, or no cluster answers at the address.
     """
 
     def __init__(

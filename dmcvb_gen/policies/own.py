@@ -68,7 +68,7 @@ class OwnPolicy(Policy):
         asked = (len(observation), self.header.action_size)
         try:
             action = np.asarray(self._function(np.array(observation, np.float32), RowGenerator(generators or ())))
-        except Exception as error:  # the code of somebody else
+        except Exception as error:  # the user's code
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise PolicyFileError(f"behaviour {self._name} failed ({type(error).__name__}: {reason})") from error
         if action.shape != asked or action.dtype.kind not in "fiu":

@@ -289,7 +289,7 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
     try:
         get_task(subset.task)
         distractors_of(subset.record.distractor)
-    except DmcvbError as error:  # code of somebody else, which is not here or does not run here
+    except DmcvbError as error:  # a user's own code, which cannot be imported or does not run on this machine
         return [Issue(UNCHECKED, subset.name, f"values, physics and images cannot be checked here: {error}")]
     try:
         return list(contents.check_contents(subset, backgrounds))

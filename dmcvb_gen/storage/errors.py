@@ -24,7 +24,7 @@ REFUSALS = ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "Si
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LONGEST_REASON = 300
 _SECRETS = (
-    # Bounded, or a message that quotes 100,000 letters of somebody's file would take a minute.
+    # Bounded, or a message that quotes 100,000 letters of a file would take a minute.
     (
         re.compile(r"(?i)((?:secret|password|token|key|sig|signature|credential)[\w-]{0,40}[\"']?\s*[=:]\s*)\S+"),
         r"\1...",

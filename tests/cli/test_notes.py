@@ -1,4 +1,4 @@
-"""What commands say unasked, because silence would cost somebody an afternoon."""
+"""What commands say unasked, because silence would cost a user an afternoon."""
 
 from __future__ import annotations
 

@@ -148,5 +148,5 @@ def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
             inside.mkdir()
             kind.write(sources if kind.merges else sources[0], inside)
             write_json(inside / STAMP, work.stamp)
-            if not work.done:  # somebody else may have been faster
+            if not work.done:  # another process may have been faster
                 inside.rename(work.folder)

@@ -18,7 +18,7 @@ from dmcvb_gen.storage.store import Store, open_store
 
 INFO = "meta/info.json"
 NO_DATA = ("README.md", "LICENSE")
-"""Files that may be beside an export, whoever wrote them."""
+"""Files of any origin that may lie next to an export."""
 
 
 def export_format(folder: str | Path) -> str | None:
