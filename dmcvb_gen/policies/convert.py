@@ -254,7 +254,7 @@ def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[s
 
 
 def _check_actions(path: Path, task: Task, low: np.ndarray, high: np.ndarray) -> None:
-    """Refuse an actor whose actions have other bounds than the task's, as the file does not say how its environment took them."""
+    """Refuse an actor with other action bounds than the task's: its file does not say how they were taken."""
     theirs = [np.round(bound.astype(float), 6).tolist() for bound in (low, high)]
     ours = [np.round(bound.astype(float), 6).tolist() for bound in (task.action_low, task.action_high)]
     if theirs != ours:
