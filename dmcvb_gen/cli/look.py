@@ -69,8 +69,8 @@ def info(path, options, as_json):
     if facts["missing"]:
         count = len(facts["missing"])
         click.echo(f"{count:,} of {pluralize(count + len(facts['subsets']), 'subsets')} have no local episodes.")
-    for line in dict.fromkeys(_look_of(subset) for subset in facts["subsets"]):
-        click.echo(f"images: {line}")
+    for line in dict.fromkeys(line for subset in facts["subsets"] for line in _look_of(subset)):
+        click.echo(line)
     policies = dict.fromkeys(name for subset in facts["subsets"] for name in subset["policies"])
     if policies:
         click.echo(textwrap.fill(f"policies: {', '.join(policies)}", 80, break_on_hyphens=False))
@@ -81,16 +81,19 @@ def info(path, options, as_json):
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
     if facts["digest"]:
         click.echo(f"digest {facts['digest']}")
-        if not facts["compared"]:
+        if facts["shipped"]:
+            click.echo(f"The digest is that of the {facts['shipped']} that the package ships.")
+        elif not facts["compared"]:
             click.echo("The digest was not compared; give the one that you expect: RELEASE@sha256:DIGEST")
 
 
-def _look_of(subset) -> str:
-    """Size, renderer and videos of a subset's images."""
-    videos = subset["videos"]
-    shown = f"; videos: {videos['source']} ({videos['split']})" if videos else ""
+def _look_of(subset) -> list[str]:
+    """Lines on size, renderer and videos of a subset's images."""
     samples = f", {subset['samples']} samples a pixel" if subset["samples"] else ""
-    return f"{subset['size']} x {subset['size']} pixels, {subset['renderer']}{samples}{shown}"
+    lines = [f"images: {subset['size']} x {subset['size']} pixels, {subset['renderer']}{samples}"]
+    if videos := subset["videos"]:
+        lines.append(f"videos: {videos['source']} ({videos['split']})")
+    return lines
 
 
 @click.command()

@@ -29,6 +29,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
     """Subsets of a release with episodes, steps, bytes and returns, the paper's row beside each.
 
     "normalized" is the mean return where the release's random actions have 0 and its expert 100; else None.
+    "shipped" names the release that the package ships the manifest of, if its digest is the same.
     "missing" names the subsets of which nothing is here, and how many episodes they are to have.
 
     Raises:
@@ -70,11 +71,22 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
         part=bool(release.copy and release.shortfalls),
         digest=release.digest,
         compared=release.compared,
+        shipped=_shipped_twin(release.manifest.name, release.digest),
         steps=sum(subset["steps"] for subset in subsets),
         bytes=sum(file.bytes for shard in release.shards() if shard.here for file in shard.files),
         subsets=subsets,
         missing={name: planned for name, (here, planned) in release.shortfalls.items() if not here},
     )
+
+
+def _shipped_twin(name: str, digest: str | None) -> str | None:
+    """Name and version of the shipped manifest of that name, if it has the digest."""
+    from dmcvb_gen.generate.shipped import load_shipped, shipped_manifests
+
+    if name not in shipped_manifests():
+        return None
+    shipped = load_shipped(name)
+    return f"{name} {shipped.manifest.version}" if shipped.digest == digest else None
 
 
 def describe_package() -> dict[str, Any]:

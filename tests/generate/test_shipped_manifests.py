@@ -9,9 +9,10 @@ import random
 import pytest
 
 from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.generate.info import describe_release
 from dmcvb_gen.generate.recipe import load_recipe
 from dmcvb_gen.generate.resolve import resolve
-from dmcvb_gen.generate.shipped import ENDING, load_shipped, pack, shipped_manifests
+from dmcvb_gen.generate.shipped import ENDING, Shipped, load_shipped, pack, shipped_manifests
 from tests.conftest import invoke
 
 
@@ -80,3 +81,12 @@ def test_other_manifests_are_refused_in_one_line(given, message, tmp_path):
     done = run("--manifest", given, "--out", tmp_path / "out")
     assert done.exit_code == 2 and message in done.output and len(done.output.splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_info_names_the_shipped_release_of_the_same_digest(small_release, monkeypatch):
+    release, other = Release.open(small_release), load_shipped("quickstart")
+    monkeypatch.setattr("dmcvb_gen.generate.shipped.shipped_manifests", lambda: [release.manifest.name])
+    for shipped in (Shipped(release.manifest, (), {}), other):
+        monkeypatch.setattr("dmcvb_gen.generate.shipped.load_shipped", lambda name, shipped=shipped: shipped)
+        known = None if shipped is other else f"{release.manifest.name} {release.manifest.version}"
+        assert describe_release(small_release)["shipped"] == known
