@@ -168,7 +168,7 @@ def test_what_was_damaged_or_lost_there_is_found_and_replaced(made, tmp_path, mo
     found = [str(issue) for issue in verify(url).findings]
     assert sum(short in text or lost in text for text in found) == 2
     assert any(wrong in str(issue) for issue in verify(url, everything=True).findings)
-    with pytest.raises(StoreError, match="has 4 bytes instead of .*--repair"):
+    with pytest.raises(StoreError, match="has 4 bytes instead of .*with repair"):
         publish(made, url)
     assert publish(made, url, repair=True).moved == 3 and content(there) == before
     assert verify(url, everything=True).sound
