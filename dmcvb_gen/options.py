@@ -95,7 +95,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def with_parameters(message: str) -> str:
-    """A message with the names of parameters in place of flags; commands in it stay as they are."""
+    """Replace the flags of a message by the names of parameters, but not within commands."""
 
     def renamed(found: re.Match[str]) -> str:
         name = found["name"]

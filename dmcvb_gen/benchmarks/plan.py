@@ -265,7 +265,7 @@ class SubsetFinder:
         return names and tuple(Slice(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
 
     def missing(self, benchmark: str) -> list[Missing]:
-        """What was asked for in vain, by task."""
+        """Requests that nothing in the release fits, by task."""
         return [
             Missing(
                 benchmark,

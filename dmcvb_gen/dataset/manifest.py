@@ -592,19 +592,14 @@ def _without_needless(whole: Iterable[tuple[Resolved, SubsetRecord]]) -> list[Re
     for recipe, subset in whole:
         asked.setdefault(recipe.sha256, (recipe, []))[1].append(subset)
     for digest, (recipe, subsets) in sorted(asked.items()):
-        covering = [
-            subset
-            for other, theirs in (given for sha256, given in asked.items() if sha256 != digest)
-            if _described(other) == _described(recipe)
-            for subset in theirs
-        ]
-        if all(any(_covers(subset, asked_for) for subset in covering) for asked_for in subsets):
+        covering: dict[str, list[SubsetRecord]] = {}
+        for sha256, (other, theirs) in asked.items():
+            if sha256 != digest and _described(other) == _described(recipe):
+                for subset in theirs:
+                    covering.setdefault(subset.name, []).append(subset)
+        if all(any(_merged(more, one) == more for more in covering.get(one.name, ())) for one in subsets):
             del asked[digest]
     return [recipe for recipe, _ in asked.values()]
-
-
-def _covers(one: SubsetRecord, other: SubsetRecord) -> bool:
-    return one.name == other.name and _merged(one, other) == one
 
 
 def _described(recipe: Resolved) -> tuple[Any, ...]:

@@ -116,7 +116,7 @@ def unpack_files(archive: bytes) -> dict[str, bytes]:
 
 
 def pack(files: Mapping[str, bytes], out: Path) -> None:
-    """Put the policies of some tasks, "<task>/<file>" -> bytes, into archives and list; others stay as they are."""
+    """Put the policies of some tasks, "<task>/<file>" -> bytes, into archives and list; keep all others."""
 
     def others(names: Iterable[str]) -> list[str]:
         return [name for name in names if name.split("/")[0] not in tasks]

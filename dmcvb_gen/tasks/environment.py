@@ -248,7 +248,7 @@ def _arrays(model: mujoco.MjModel, beginnings: tuple[str, ...] = ("",)) -> dict[
 
 
 class _Writer(pickle.Pickler):
-    """Of a random generator it writes the state, and not the seed that the generator was made with."""
+    """It writes the state of a random generator, not the seed that the generator was made with."""
 
     def reducer_override(self, thing: Any) -> Any:
         return (dict, (thing.state,)) if isinstance(thing, np.random.BitGenerator) else NotImplemented

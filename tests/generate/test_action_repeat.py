@@ -67,7 +67,7 @@ def test_a_policy_that_was_trained_at_2_acts_at_2(walkers):
     ({}, 2),
     ({"action_repeat": 1}, 1),
     ({"action_repeat": 4}, 4),
-    ({"training": {"converted_from": "their.zip"}}, 1),  # nobody knows at which repeat it was trained
+    ({"training": {"converted_from": "their.zip"}}, 1),  # the repeat of its training is unknown
 ])  # fmt: skip
 def test_the_header_says_for_how_many_control_steps_a_policy_acts(facts, held):
     task, bundled = get_task("walker-walk").at(1), load_policy(bundled_policies("walker-walk", "expert")[0])
