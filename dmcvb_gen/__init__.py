@@ -85,7 +85,7 @@ def open(
     Raises:
       StoreError: there is no release, it cannot be read, it has another digest, or the URL needs a package that is
         not installed.
-      DmcvbError: `painting` has an unknown field or value.
+      DmcvbError: `painting` has an unknown value.
     """
     if paint or painting:
         from dmcvb_gen.loaders.painted import open_painted

@@ -152,40 +152,25 @@ def read_yaml(path: Path | Traversable) -> Any:
         content = file.read(LARGEST_YAML + 1)
     if len(content) > LARGEST_YAML:
         raise ValueError(f"over {LARGEST_YAML // 1000} kB, which no settings need")
+
+    class OnceLoader(yaml.SafeLoader):
+        """PyYAML itself would keep the last value of a key that is given twice, and drop the others without a word."""
+
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            node = super().compose_mapping_node(anchor)
+            keys = [key for key, _ in node.value]
+            for number, key in enumerate(keys):
+                again = any((key.tag, key.value) == (other.tag, other.value) for other in keys[:number])
+                if again and not key.tag.endswith(":merge"):  # what a merge brings may be given again: none is lost
+                    raise ValueError(f"{key.value} is given twice (line {key.start_mark.line + 1}); keep one")
+            return node
+
     try:
-        loader = yaml.SafeLoader(content.decode())
-        node = loader.get_single_node()
-        twice = _repeated_key(node)
-        value = None if node is None or twice else loader.construct_document(node)
+        return yaml.load(content.decode(), OnceLoader)
     except UnicodeDecodeError:
         raise ValueError("not text in UTF-8") from None
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(f"not YAML: {' '.join(str(error).split())}") from None
-    if twice:
-        raise ValueError(f"{twice.value} is given twice (line {twice.start_mark.line + 1}); keep one")
-    return value
-
-
-def _repeated_key(root: Any) -> Any:
-    """The node of the first key that a mapping below a YAML node has twice, None if there is none.
-
-    PyYAML would keep the last value and drop the others without a word. Merge keys (`<<`) may repeat: none is lost.
-    """
-    nodes, seen, found = [root], set(), []
-    while nodes:
-        node = nodes.pop()
-        if isinstance(node, tuple):  # a key and its value
-            nodes += node
-        elif id(node) not in seen and isinstance(getattr(node, "value", None), list):  # an alias is its anchor's node
-            seen.add(id(node))
-            nodes += node.value
-            known = set()
-            for key in (pair[0] for pair in node.value if isinstance(pair, tuple)):
-                name = (key.tag, str(key.value))
-                if name in known and not key.tag.endswith(":merge"):
-                    found.append(key)
-                known.add(name)
-    return min(found, key=lambda key: key.start_mark.index, default=None)
 
 
 def write_json(path: str | Path, value: Any) -> None:

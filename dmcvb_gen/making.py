@@ -192,38 +192,6 @@ def _cached(task: str, levels: tuple[str, ...], episodes: int | None, options: d
 
 
 @checked
-def make_part(
-    release: Location,
-    part: str,
-    *,
-    only: Names = (),
-    episode_range: Span | None = None,
-    workers: Workers | None = None,
-    storage_options: dict[str, Any] | None = None,
-    other_versions: bool = False,
-) -> None:
-    """Make a part of a release that was begun, on one of many machines.
-
-    Args:
-      release (RELEASE|URL): Where `cluster begin` created the release.
-      part (K/N): Part K of N.
-      only (PATTERN): Make only these subsets.
-      episode_range (RANGE): Make only the shards with episodes A to B - 1.
-      workers: Worker processes. [default: a core each, as far as memory allows]
-      storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
-      other_versions: Go on even if package versions have changed.
-    """
-    from dmcvb_gen.generate.plan import make_plan, run_plan, start
-    from dmcvb_gen.storage.store import open_store
-
-    number, _, count = part.partition("/")
-    store = open_store(release, storage_options)
-    plan = make_plan(None, store, as_names(only), episode_range, (int(number), int(count)))
-    start(plan, other_versions, "cluster part")
-    run_plan(plan, workers, finishing=False)
-
-
-@checked
 def paint(
     release: Location,
     *,

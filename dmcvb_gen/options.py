@@ -54,14 +54,12 @@ _PARAMETERS = {
     "all": "everything",
     "benchmark": "benchmarks",
     "distractor": "distractors",
-    "executor": "workers",
     "goal": "goals",
     "label": "labels",
     "level": "levels",
     "no-pixels": "pixels=False",
     "option": "storage_options",
     "range": "episode_range",
-    "ray-address": "workers",
     "set": "settings",
 }
 """Flags whose parameters have other names."""

@@ -40,15 +40,10 @@ class ProgressBar(tqdm):
         self.total = count
 
     def advance(self, what: str, steps: int) -> None:
-        """Name the item in progress, and count steps. With none, the name alone is shown.
-
-        Time in which nothing is counted, because what the steps need is being made, says nothing of their rate.
-        """
+        """Name the item in progress, and count steps. With none, the name alone is shown."""
         self.set_description(what, refresh=False)
         self.update(steps)
         if not steps:
-            if not self.disable and self.n == self.last_print_n:
-                self.last_print_t = self._time()
             self.refresh()
 
     def refresh(self, *args: Any, **options: Any) -> bool | None:

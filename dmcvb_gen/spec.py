@@ -90,8 +90,6 @@ ALL = "all"
 VISIBLE, HIDDEN, FIXED = GOAL_MODES = tuple(mode.value for mode in GoalMode)
 """The stored names of the goal modes."""
 
-GOAL_PICTURES = (VISIBLE, HIDDEN)
-"""The two kinds of a maze's images: with the goal, and without it."""
 
 REWARDS = ("saturated", "geodesic")
 """How a maze's reward measures the distance to the goal: DMC-VB's way first, then the shortest path's length."""

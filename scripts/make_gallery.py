@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import dmcvb_gen
 from dmcvb_gen.dataset import Release
+from dmcvb_gen.generate.preview import save_video, video_frames
 from dmcvb_gen.loaders.register import MAZES, TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,11 +43,11 @@ def command(*arguments: object) -> None:
     subprocess.run([sys.executable, "-m", "dmcvb_gen", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
 
 
-def moving(release: Path, only: str, name: str, *options: object) -> None:
-    """`preview` of some subsets as docs/gallery/<name>.webp."""
-    out = release / "preview" / name
-    command("preview", release, "--only", only, "--video", "webp", "--frames", FRAMES, "--out", out, *options)
-    shutil.copy(out / "preview.webp", PICTURES / f"{name}.webp")
+def moving(folder: Path, only: str, name: str, scale: int, episode: int | None = None) -> None:
+    """An episode of some subsets side by side, as docs/gallery/<name>.webp."""
+    release = Release.open(folder)
+    subsets = [release[subset] for subset in release.select([only])]
+    save_video(PICTURES / f"{name}.webp", video_frames(subsets, scale, FRAMES, episode))
 
 
 def styles(work: Path) -> None:
@@ -59,7 +60,7 @@ def styles(work: Path) -> None:
         shown = subset.read("exogenous/style")[:, 0] // 100
         for style in sorted(set(shown.tolist())):
             first = int((shown == style).argmax())
-            moving(work / split, subset.name, f"style-{style}", "--episode", first, "--scale", 1)
+            moving(work / split, subset.name, f"style-{style}", 1, first)
 
 
 # -- the hero: one instant of three tasks and a maze, under what varies in their pictures ---------
@@ -149,7 +150,7 @@ def main() -> None:
         (work / "gallery.yaml").write_text(yaml.safe_dump(RECIPE))
         command("rollout", "--recipe", work / "gallery.yaml", "--out", work / "all")
         for task in (*TASKS, *MAZES):
-            moving(work / "all", f"{task}/*/*", task, "--scale", 2)
+            moving(work / "all", f"{task}/*/*", task, 2)
         sheet = ["--only", "ant-maze-easy7x7a/*/visible", "--episodes", 1, "--out", work / "sheet"]
         command("preview", work / "all", *sheet)
         shutil.copy(work / "sheet/contact_sheet.png", ROOT / "docs/gallery/ant-maze.png")

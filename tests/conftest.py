@@ -47,6 +47,12 @@ def small_recipe(**changes):
     return make_recipe(fields | changes)
 
 
+def short_recipe(**changes):
+    """As `small_recipe`, with episodes of 20 steps; `changes` are of the subsets."""
+    [pattern] = small_recipe().model_dump(mode="json")["subsets"]
+    return small_recipe(subsets=[pattern | {"max_steps": 20} | changes])
+
+
 def roll_out(recipe, folder, works=lambda works: works, workers=1, only=(), pixels=True):
     """Make a release in this process (or in workers) and give it as it is then."""
     plan = make_plan(recipe, folder, only, pixels=pixels)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.util
-import os
 import signal
 import sys
 import threading
 import warnings
-from pathlib import Path
 from typing import NoReturn
 
 import click
@@ -39,7 +36,7 @@ GROUPS = {
     "Look and check": {
         "list": ("look:list_command", "List tasks, levels, distractors, recipes and renderers."),
         "info": ("look:info", "Show subsets, size and returns of a release; the paper's returns."),
-        "preview": ("look:preview", "Write a contact sheet and a video of a release."),
+        "preview": ("view:preview", "Write a contact sheet and a video of a release."),
         "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
         "verify": ("release:verify", "Check every file, value, state and image of a release."),
         "validate": ("validate:validate", "Train the paper's agents on a release and report their scores."),
@@ -100,7 +97,6 @@ class LazyGroup(click.Group):
 
     def invoke(self, ctx):
         _asked_to_stop.clear()
-        _name_glfw_library()
         named = at_terminal.set(True)
         try:
             return super().invoke(ctx)
@@ -135,20 +131,6 @@ def main():
 
 
 _asked_to_stop = threading.Event()
-
-
-def _name_glfw_library() -> None:
-    """Tell glfw where its library is, for this process and its workers; nothing is drawn with it.
-
-    MuJoCo imports glfw, which otherwise looks for libraries with a process of its own. That takes 70 ms, and prints a
-    traceback if Ctrl-C comes meanwhile.
-    """
-    found = importlib.util.find_spec("glfw")
-    if sys.platform == "linux" and found and found.origin:
-        variant = "wayland" if os.environ.get("XDG_SESSION_TYPE") == "wayland" else "x11"
-        library = Path(found.origin).with_name(variant) / "libglfw.so"
-        if library.exists():
-            os.environ.setdefault("PYGLFW_LIBRARY", str(library))
 
 
 def _wrong_usage(error: click.UsageError) -> str:

@@ -205,7 +205,7 @@ def evaluate_behaviour(as_json, progress, **options):
     \b
     dmcvb-gen evaluate-behaviour
     dmcvb-gen evaluate-behaviour walker-walk --level expert --seed 1 --json
-    dmcvb-gen evaluate-behaviour ant-maze-easy7x7a --pictures paths
+    dmcvb-gen evaluate-behaviour ant-maze-easy7x7a
     """
     rows = evaluate(**options)
     if as_json:

@@ -15,8 +15,6 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON f
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C or SIGTERM, as shells have it; 1 means that a check failed."""
-WORDS = "dmcvb_gen.words"
-"""Key in a context's `meta`: the words of the command line."""
 
 
 class GroupedCommand(click.Command):
@@ -30,10 +28,6 @@ class GroupedCommand(click.Command):
     def __init__(self, *arguments: Any, option_groups: dict[str, tuple[str, ...]] | None = None, **options: Any):
         super().__init__(*arguments, **options)
         self.option_groups = option_groups or {}
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        ctx.meta[WORDS] = tuple(args)
-        return super().parse_args(ctx, args)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         options = [parameter for parameter in self.get_params(ctx) if isinstance(parameter, click.Option)]
@@ -133,14 +127,6 @@ class OutPath(click.Path):
 def moved_files(moved: Any) -> str:
     """Say what a publish or fetch moved."""
     return f"{moved.files} files, {format_bytes(moved.bytes)}; {moved.moved} of them copied now"
-
-
-def format_duration(seconds: float) -> str:
-    """5400 -> "90 min"."""
-    for limit, unit, size in ((120, "s", 1), (7200, "min", 60), (172800, "h", 3600)):
-        if seconds < limit:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 86400:.1f} days"
 
 
 SECRETS = ("key", "secret", "token", "password", "credential")

@@ -1,16 +1,12 @@
-"""list, info, status, preview."""
+"""list, info, status."""
 
 from __future__ import annotations
 
 import textwrap
-from pathlib import Path
 
 import click
 
 from dmcvb_gen.cli.common import (
-    OutPath,
-    answer,
-    format_duration,
     json_option,
     print_json,
     print_table,
@@ -96,34 +92,6 @@ def _look_of(subset) -> list[str]:
     return lines
 
 
-@click.command()
-@click.argument("path")
-@click.option("--only", multiple=True, metavar="PATTERN", help="Show only these subsets.")
-@click.option("--out", type=OutPath(path_type=Path), help="Output folder.  [default: PATH/preview]")
-@click.option("--episodes", type=click.IntRange(1), default=4, show_default=True, help="Episodes per subset.")
-@click.option("--scale", type=click.IntRange(1, 8), help="Enlarge the images.  [default: 2; videos of 512 pixels]")
-@click.option(
-    "--frames", type=click.IntRange(1), default=200, show_default=True, help="Frames of the video, at 20 per second."
-)
-@click.option("--episode", type=click.IntRange(0), help="Episode of the video.  [default: the first of each subset]")
-@click.option(
-    "--video",
-    type=click.Choice(["mp4", "webp", "gif"]),
-    help="Format of the video.  [default: mp4, or webp without imageio-ffmpeg]",
-)
-@json_option
-def preview(path, only, out, as_json, **options):
-    """Write a contact sheet (PNG) and a video of a release.
-
-    \b
-    dmcvb-gen preview releases/demo
-    """
-    from dmcvb_gen.generate.preview import write_preview
-
-    files = list(map(str, write_preview(path, out, only=only, **options)))
-    answer(as_json, files, *files)
-
-
 @click.command("list")
 @json_option
 def list_command(as_json):
@@ -168,7 +136,7 @@ def list_command(as_json):
 @remote_option
 @json_option
 def status(place, options, as_json):
-    """Show the progress of an unfinished release: shards done and late, time left.
+    """Show the progress of an unfinished release: shards done and open.
 
     It reads the records, so it works from any machine.
 
@@ -182,21 +150,10 @@ def status(place, options, as_json):
     if as_json:
         return print_json(found.facts())
     print_table(
-        ("subset", "done", "late", "open"),
-        [
-            (subset.name, f"{subset.done:,}", f"{subset.late:,}", f"{subset.total - subset.done - subset.late:,}")
-            for subset in found.subsets
-        ],
+        ("subset", "done", "open"),
+        [(subset.name, f"{subset.done:,}", f"{subset.total - subset.done:,}") for subset in found.subsets],
         title=f"{found.name}: {found.done:,} of {found.total:,} shards",
     )
-    if found.shards_per_hour and found.done < found.total:
-        last, left = format_duration(found.silence), format_duration(found.seconds_left)
-        click.echo(f"{found.shards_per_hour:,.0f} shards/h, last one {last} ago; {left} left")
-    if found.late:
-        click.echo(
-            f"{pluralize(found.late, 'shards')} late (later ones are done). They are in progress, belong to a part "
-            "that has not run, or were lost with a worker. Rerun the rollout to make them."
-        )
     if found.done == found.total:
         click.echo(
             "complete"

@@ -10,19 +10,17 @@ A function's signature has the types and the defaults, its docstring the help; n
 gives `paint RELEASE --episodes A:B`. What stands in parentheses, or
 `METAVARS` has for it, shows how a value is written, and `FORMATS` reads it. A
 parameter that takes several names can be repeated and loses its "s" (levels: --level). One that is true by default is
-switched off (pixels: --no-pixels). With `workers` come --executor and --ray-address.
+switched off (pixels: --no-pixels).
 """
 
 import functools
 import inspect
-import math
 import re
 import typing
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import click
-from click.core import ParameterSource
 
 from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
 from dmcvb_gen.options import LOCAL, parts_of
@@ -54,8 +52,6 @@ def command_of(
     def decorate(show: Callable) -> click.Command:
         @functools.wraps(show)
         def callback(as_json: bool, **given: Any) -> Any:
-            if "executor" in given:
-                given["workers"] = _executor(given["workers"], given.pop("executor"), given.pop("ray_address"))
             return show(as_json=as_json, progress=not as_json, **given)
 
         own = getattr(show, "__click_params__", [])
@@ -84,6 +80,7 @@ def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[cli
             found.append(click.Argument([name], type=kind, required=required, nargs=-1 if several else 1, metavar=form))
             continue
         flag, default = FLAGS.get(name, name).replace("_", "-"), parameter.default
+        metavar = "N|ray" if Ray in kinds else metavar
         given: dict[str, Any] = dict(metavar=metavar, required=required, type=kind)
         if default is True:
             flag, text = f"no-{flag}", text.removeprefix("False: ")
@@ -100,8 +97,6 @@ def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[cli
         elif not required and default is not None:
             given |= dict(default=default, show_default=True)
         found.append(click.Option([f"--{flag}", name], help=text, **given))
-        if Ray in kinds:
-            found += parameters_of(_cluster, ("",))
     return found
 
 
@@ -119,6 +114,8 @@ def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
         return OutPath()
     if Literal in map(typing.get_origin, kinds):
         return click.Choice(typing.get_args(kinds[0]))
+    if Ray in kinds:
+        return WorkersType(min=1)
     if not {int, float} & {*kinds}:
         return str
     sides = {"ge": ("min", False), "gt": ("min", True), "le": ("max", False), "lt": ("max", True)}
@@ -128,50 +125,21 @@ def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
             if hasattr(limit, name):
                 bounds |= {side: getattr(limit, name), f"{side}_open": is_open}
     if float in kinds:
-        return Finite(**bounds)
+        return click.FloatRange(**bounds)
     return click.IntRange(**bounds) if bounds else int
 
 
-class Finite(click.FloatRange):
-    """A number that is neither infinite nor nan."""
+class WorkersType(click.IntRange):
+    """A number of processes, or "ray": the cluster that RAY_ADDRESS names, else one on this machine."""
 
-    def convert(self, value, param, ctx):
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number.", param, ctx)
-        return number
+    def convert(self, value: Any, param: Any, ctx: Any) -> Workers:
+        return Ray() if value == "ray" else super().convert(value, param, ctx)
 
 
 def _repeatable(text: str) -> str:
     """ "What.  [default: x]" -> "What. Repeatable.  [default: x]"."""
     words, mark, default = text.partition("  [")
     return f"{words} Repeatable.{mark}{default}"
-
-
-def _cluster(*, executor: Literal["processes", "ray"] = "processes", ray_address: str | None = None):
-    """Return the options that come with `workers`.
-
-    Args:
-      executor: Executor that runs the jobs: local processes or Ray.
-      ray_address (ADDRESS): Address of the Ray cluster. [default: RAY_ADDRESS, or a local one]
-    """
-
-
-def _executor(workers: int, executor: str, address: str | None) -> Workers:
-    """The executor that the options ask for.
-
-    Raises:
-      click.UsageError: an option has no effect with this executor.
-    """
-    if executor == "ray":
-        if click.get_current_context().get_parameter_source("workers") == ParameterSource.COMMANDLINE:
-            raise click.UsageError(
-                "--workers has no effect with --executor ray, which uses every core of the cluster: remove it."
-            )
-        return Ray(address)
-    if address:
-        raise click.UsageError("--ray-address has no effect without --executor ray: remove it.")
-    return workers
 
 
 # -- how values are written -----------------------------------------------------------------------

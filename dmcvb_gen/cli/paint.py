@@ -42,24 +42,10 @@ def fetch(as_json, **options):
     dmcvb-gen fetch s3://bucket/light --paint --size 84 --out data/mini84
     """
     moved, done = download(options, notify=_tell)
-    out, episodes = options["out"], options["episode_range"]
+    out = options["out"]
     facts = dataclasses.asdict(moved) | (_painted_facts(done) if done else {})
-    lines = [f"{out}: {moved_files(moved)}", *(_whole_shards(out, episodes) if episodes else ())]
-    lines += _painted(out, done) if done else ()
+    lines = [f"{out}: {moved_files(moved)}", *(_painted(out, done) if done else ())]
     answer(as_json, facts, *lines, code=1 if done and done.differing else 0)
-
-
-def _whole_shards(out, episodes):
-    """A line if shards brought more episodes than were asked for."""
-    from dmcvb_gen.dataset.gate import Release
-
-    first, last = episodes
-    for name, subset in Release.open(out).subsets.items():
-        here = subset.episodes
-        if len(here) and (here[0] < first or here[-1] >= last):
-            span = f"{here[0]}:{here[-1] + 1}"
-            yield f"Shards are fetched whole: {name} has the episodes {span}; you asked for {first}:{last}."
-            return
 
 
 def _tell(text):

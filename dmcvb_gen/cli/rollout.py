@@ -8,7 +8,7 @@ import shlex
 import click
 
 from dmcvb_gen import making
-from dmcvb_gen.cli.common import answer, print_json, print_table, remote_option
+from dmcvb_gen.cli.common import answer, json_option, print_json, print_table, remote_option
 from dmcvb_gen.cli.options import command_of, parse_part
 from dmcvb_gen.cli.slurm import script_for_slurm
 from dmcvb_gen.options import progress_bar
@@ -97,7 +97,9 @@ def begin(as_json, progress, **options):
     answer(as_json, {"out": plan.store.place, "shards": len(plan.works)}, f"{plan.store.place}: {begun}")
 
 
-@command_of(making.make_part, "release", "part")
+@command_of(making.rollout, only=("only", "episode_range", "workers", "storage_options", "other_versions"))
+@click.argument("release", metavar="RELEASE|URL")
+@click.argument("part", metavar="K/N")
 def part(release, part, as_json, workers, other_versions, only, episode_range, storage_options, progress):
     """Make part K of N of a release that was begun: every N-th shard, starting with the K-th."""
     from dmcvb_gen.generate.plan import make_plan, start
@@ -112,17 +114,18 @@ def part(release, part, as_json, workers, other_versions, only, episode_range, s
 @click.command()
 @click.argument("release", metavar="RELEASE|URL")
 @remote_option
-@click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
+@json_option
 def finish(release, options, as_json):
     """Write the manifest of all finished shards. Exit code 1 while shards are missing."""
     from dmcvb_gen.dataset.gate import Release
     from dmcvb_gen.dataset.writer import finish as write
+    from dmcvb_gen.generate.progress import missing_subsets
     from dmcvb_gen.storage.store import open_store
 
     store = open_store(release, options)
     Release.in_making(store)  # or says that nothing was begun there
     done = write(store)
-    missing = _missing(done)
+    missing = missing_subsets(done)
     state = "complete"
     if missing:
         state = f"not complete; shards are missing in {pluralize(len(missing), 'subsets')}, e.g. {missing[0]}"
@@ -130,13 +133,13 @@ def finish(release, options, as_json):
     answer(as_json, facts, f"{store.place}: {state}", code=1 if missing else 0)
 
 
-@command_of(making.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
+@click.command()
+@click.argument("release", metavar="RELEASE|URL")
 @click.option("--tasks", "count", type=click.IntRange(1), required=True, metavar="N", help="Tasks of the Slurm array.")
 @click.option("--cores", type=click.IntRange(1), default=1, show_default=True, help="Cores of each task.")
-def slurm(count, cores, as_json, progress, **options):
-    """Print a script for `sbatch` that makes a release by an array of N tasks."""
-    plan = _plan(options)  # or says why each task would be refused
-    click.echo(script_for_slurm(count, cores, plan.store.place), nl=False)
+def slurm(release, count, cores):
+    """Print a script for `sbatch` that makes a begun release by an array of N tasks."""
+    click.echo(script_for_slurm(count, cores, release), nl=False)
 
 
 for subcommand in (begin, part, finish, slurm):
@@ -144,7 +147,7 @@ for subcommand in (begin, part, finish, slurm):
 
 
 def _plan(options):
-    """The plan of a command line, with notes on what is asked for and what exists."""
+    """The plan of a command line, with a note on videos that it leaves out."""
     from dmcvb_gen.distractors.backgrounds import videos_by_split
     from dmcvb_gen.generate.plan import plan_of
 
@@ -157,14 +160,12 @@ def _plan(options):
             "To choose them yourself, put them into folders named train and val.",
             err=True,
         )
-    if plan.growth and plan.there:
-        added = ", ".join(plan.growth[:3]) + (f" and {len(plan.growth) - 3} more" if len(plan.growth) > 3 else "")
-        click.echo(f"{plan.store.place} holds {plan.there} already; this adds {added}.", err=True)
     return plan
 
 
 def _run(plan, workers, as_json, whole=True):
     from dmcvb_gen.generate.plan import run_plan
+    from dmcvb_gen.generate.progress import missing_subsets
 
     finished = 0
 
@@ -176,7 +177,7 @@ def _run(plan, workers, as_json, whole=True):
     with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
     release, steps, place = made.release, made.steps, plan.store.place
-    complete = whole and not _missing(release)
+    complete = whole and not missing_subsets(release)
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))
     named = shlex.quote(str(place))
     state = "complete" if complete else f"not complete yet (dmcvb-gen status {named} says what is missing)"
@@ -187,15 +188,6 @@ def _run(plan, workers, as_json, whole=True):
     images = not is_url(str(place)) and any(layer.kind == "images" for layer in release.layers.values())
     look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if images else "")
     answer(as_json, facts, done, *([look] if whole else []))
-
-
-def _missing(release):
-    """Subsets that recipes ask for, and that a release does not have, or not whole."""
-    from dmcvb_gen.dataset.gate import Release
-
-    asked = {record.name: record.episodes for record in Release.in_making(release.store).manifest.subsets}
-    there = {} if release.in_the_making else {record.name: record.episodes for record in release.manifest.subsets}
-    return [name for name, episodes in asked.items() if there.get(name, 0) < episodes]
 
 
 def _show_plan(plan, as_json):

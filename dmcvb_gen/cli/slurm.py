@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import shlex
 
-import click
-
-from dmcvb_gen.cli.common import WORDS
-
 SLURM = """#!/bin/bash
 # An array of {count} tasks: sbatch this file. A preempted task is requeued and resumes.
 #SBATCH --job-name={name}
@@ -19,7 +15,6 @@ SLURM = """#!/bin/bash
 set -euo pipefail
 
 : "${{SLURM_ARRAY_TASK_ID:?submit this with sbatch}}"
-{begin} # quiet if another task was first
 if [ "$SLURM_ARRAY_TASK_ID" = 1 ]; then
   finish="{name}-finish-$SLURM_ARRAY_JOB_ID"
   if [ -z "$(squeue --noheader --name="$finish")" ]; then # not there from before a requeue
@@ -31,23 +26,11 @@ exec dmcvb-gen cluster part {place} "$SLURM_ARRAY_TASK_ID/{count}" --workers {co
 
 
 def script_for_slurm(count: int, cores: int, place: str) -> str:
-    """A script for sbatch that makes a release in `count` tasks; each makes its part of the shards."""
+    """A script for sbatch that makes a begun release in `count` tasks; each makes its part of the shards."""
     return SLURM.format(
         count=count,
         cores=cores,
         name="dmcvb-gen",
         place=shlex.quote(place),
-        begin=shlex.join(["dmcvb-gen", "cluster", "begin", *_words_without("--tasks", "--cores")]),
         finish=shlex.quote(shlex.join(["dmcvb-gen", "cluster", "finish", place])),
     )
-
-
-def _words_without(*flags: str) -> list[str]:
-    """The words of the command line but for some flags and their values."""
-    words, kept = iter(click.get_current_context().meta[WORDS]), []
-    for word in words:
-        if word in flags:
-            next(words, None)
-        elif not any(word.startswith(f"{flag}=") for flag in flags):
-            kept.append(word)
-    return kept

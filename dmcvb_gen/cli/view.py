@@ -1,4 +1,4 @@
-"""view, card, import."""
+"""preview, view, card, import."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import click
 
 from dmcvb_gen.cli.common import answer
 from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.generate.preview import write_preview
 from dmcvb_gen.options import refuse
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.import_tfds import import_tfds
@@ -15,8 +16,19 @@ from dmcvb_gen.release.viewer import view as write_viewer
 from dmcvb_gen.text import format_bytes, pluralize
 
 
+@command_of(write_preview)
+def preview(as_json, progress, **options):
+    """Write a contact sheet (PNG) and a video (WebP) of a release.
+
+    \b
+    dmcvb-gen preview releases/demo
+    """
+    files = list(map(str, write_preview(**options)))
+    answer(as_json, files, *files)
+
+
 @command_of(write_viewer)
-@click.option("--open/--no-open", "open_it", default=None, help="Open the file.  [default: if there is a browser]")
+@click.option("--open", "open_it", is_flag=True, help="Open the file in a browser.")
 def view(open_it, as_json, **options):
     """Write one HTML file that plays episodes: images, reward, actions, states and distractor labels.
 
@@ -30,16 +42,8 @@ def view(open_it, as_json, **options):
     shows = f"{pluralize(written.episodes, 'episodes')} of {pluralize(written.subsets, 'subsets')}"
     left_out = f", one image in {written.stride}" if written.stride > 1 else ""
     answer(as_json, vars(written), f"{written.path}: {shows}{left_out}, {format_bytes(written.bytes)}")
-    if open_it or (open_it is None and not as_json and _has_browser()):
+    if open_it:
         webbrowser.open(written.path.resolve().as_uri())
-
-
-def _has_browser() -> bool:
-    """Return True if there is a graphical browser; one in the terminal would take the terminal."""
-    try:
-        return not isinstance(webbrowser.get(), webbrowser.GenericBrowser)
-    except webbrowser.Error:
-        return False
 
 
 @command_of(write_card)

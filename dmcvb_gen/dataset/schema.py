@@ -47,7 +47,7 @@ from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES, OPTIONAL_
 from dmcvb_gen.errors import StoreError
 
 PIXEL_CHUNK_STEPS = 32
-"""Steps of a chunk of images: the unit of reading (chosen with scripts/bench_store.py)."""
+"""Steps of a chunk of images: the unit of reading."""
 
 
 def trajectory_arrays(task: Any) -> tuple[ArraySpec, ...]:
@@ -108,7 +108,7 @@ def image_array(
     """The array of one view's images, or of a modality of it.
 
     Images of a moving camera are smaller as differences of neighboring pixels, one color channel at a time. If the
-    camera stands still, zstd finds the repeated rows by itself, and is faster to read (scripts/bench_store.py).
+    camera stands still, zstd finds the repeated rows by itself, and is faster to read.
 
     Args:
       name: "pixels", "pixels/top", "depth/top", ...

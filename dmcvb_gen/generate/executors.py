@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -45,11 +44,14 @@ def run_works(
     with open_pool(workers, tick=progress, kept=kept, needs=needs, most=max(len(works), 1)) as pool:
         for number, work in enumerate(works):
             pool.submit(number, run_work, work, cores.usable_cores() if alone else 1)
-        expected = _Expected(works)
-        expect(progress, expected.frames)
+        left, ended, rendered = sum(work.frames for work in works), 0, 0
+        expect(progress, left)
         for number, result in pool.results():
-            expected.done(works[number], result)
-            expect(progress, expected.frames)
+            work = works[number]
+            full = len(work.settings) * (work.steps + len(work.episodes))
+            left, ended = left - work.frames, ended + work.frames
+            rendered += round(work.frames * (result.steps + result.episodes) / full)
+            expect(progress, rendered + round(left * rendered / ended))  # the others are taken to end as early
             yield result
 
 
@@ -57,34 +59,6 @@ def default_workers(works: Sequence[Work]) -> int:
     """Processes for works, see `cores.default_workers`; few frames are worth no other process."""
     worth = sum(work.frames for work in works) // STEPS_PER_PROCESS
     return cores.default_workers(min(len(works), worth), max(map(_memory, works), default=0))
-
-
-class _Expected:
-    """Expected frames of all works: of full episodes at first, then in proportion to the finished ones."""
-
-    def __init__(self, works: Sequence[Work]):
-        self._open: Counter = Counter()
-        self._ended: Counter = Counter()
-        self._rendered: Counter = Counter()
-        for work in works:
-            self._open[_kind(work)] += work.frames
-
-    def done(self, work: Work, result: WorkResult) -> None:
-        """Count a finished work: others of its task and level are taken to end as early."""
-        kind, full = _kind(work), len(work.settings) * (work.steps + len(work.episodes))
-        self._open[kind] -= work.frames
-        self._ended[kind] += work.frames
-        self._rendered[kind] += round(work.frames * (result.steps + result.episodes) / full)
-
-    @property
-    def frames(self) -> int:
-        shares = {kind: self._rendered[kind] / planned for kind, planned in self._ended.items()}
-        return round(self._rendered.total() + sum(n * shares.get(kind, 1) for kind, n in self._open.items()))
-
-
-def _kind(work: Work) -> tuple[str, str]:
-    record = work.settings[0].record
-    return record.task, record.level
 
 
 def check_memory(works: Sequence[Work], workers: Workers) -> None:

@@ -20,7 +20,7 @@ from dmcvb_gen.generate.resolve import Resolution, resolve
 from dmcvb_gen.generate.works import Work, episodes_left, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.storage.store import Store, open_store
-from dmcvb_gen.text import as_names, pluralize
+from dmcvb_gen.text import as_names
 
 Options = Mapping[str, Any]
 """Arguments of `rollout` by name; None, False or empty if they are not given."""
@@ -35,17 +35,14 @@ class Plan:
       resolution: the recipe; None to go on with what is there.
       works: what is left to do.
       chosen: subset -> episodes that this rollout is about, whether they are there or not.
-      growth: gains of the release that is there: "walker-walk/random/none" for a new subset, "walker-walk/random/none
-        (40 episodes more)" for one that grows.
-      there: name and version of that release; "" if there is none.
+      there: whether a release is there already.
     """
 
     release: Release
     resolution: Resolution | None
     works: tuple[Work, ...]
     chosen: Mapping[str, int]
-    growth: tuple[str, ...] = ()
-    there: str = ""
+    there: bool
 
     @property
     def store(self) -> Store:
@@ -127,25 +124,8 @@ def make_plan(
     else:
         raise StoreError(f"{store.place} holds no release to go on with; give TASKs or --recipe")
     works = works_of(release, only, episodes, part=part)
-    chosen = _chosen(release, only, episodes)
-    if there is None:
-        return Plan(release, resolution, works, chosen)
-    name = f"{there.manifest.name} {there.manifest.version}"
-    return Plan(release, resolution, works, chosen, _growth(there, release, chosen), name)
-
-
-def _chosen(release: Release, only: Sequence[str], episodes: tuple[int, int] | None) -> dict[str, int]:
-    """Subset -> episodes of the shards that a plan is about."""
     everything = works_of(release, only, episodes, wanted=lambda layer, shard: True)
-    return dict(episodes_left(everything))
-
-
-def _growth(there: Release, release: Release, chosen: Mapping[str, int]) -> tuple[str, ...]:
-    old = {record.name: record.episodes for record in there.manifest.subsets}
-    asked = {record.name: record.episodes for record in release.manifest.subsets if record.name in chosen}
-    more = {name: count - old.get(name, 0) for name, count in asked.items()}
-    told = {name: f" ({pluralize(count, 'episodes')} more)" if name in old else "" for name, count in more.items()}
-    return tuple(name + told[name] for name, count in more.items() if count > 0)
+    return Plan(release, resolution, works, episodes_left(everything), there is not None)
 
 
 def start(plan: Plan, other_versions: bool = False, command: str = "rollout") -> None:

@@ -1,10 +1,7 @@
-"""Write a contact sheet (PNG) and a video of a release's episodes."""
-
-from __future__ import annotations
+"""Write a contact sheet (PNG) and a video (WebP) of a release's episodes."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -12,19 +9,17 @@ from PIL import Image, ImageDraw, ImageFont
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
-from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.extras import installed
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.options import Count, Local, Location, Names, checked
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.errors import storage_errors
-from dmcvb_gen.storage.places import local_path
-from dmcvb_gen.text import quoted
+from dmcvb_gen.text import as_names, quoted
 
 SHEET_COLUMNS = 10
 """Frames of an episode on the contact sheet, evenly spaced."""
 VIDEO_FRAMES, VIDEO_FPS = 200, 20
-SHEET_SCALE, VIDEO_SIDE = 2, 512
-"""Enlargement on the contact sheet; pixels that the shorter side of a video has at least."""
-FORMATS = ("mp4", "webp", "gif")
+VIDEO_SIDE = 512
+"""Pixels that a side of a video has at least, about."""
 LABEL_HEIGHT = 14
 
 
@@ -85,11 +80,11 @@ def video_frames(
     """An episode of every subset side by side, the first by default; (frame, height, width, 3) uint8.
 
     Args:
-      scale: enlargement of the images; by default the smallest with `VIDEO_SIDE` pixels on the shorter side.
+      scale: enlargement of the images; by default what gives a side some `VIDEO_SIDE` pixels.
     """
-    if scale is None:  # labels do not grow with the images, so two sizes say how the sides grow
-        one, two = (np.array(_grid([_subset_frames(s, n, 1, episode) for s in subsets]).shape[1:3]) for n in (1, 2))
-        scale = max(1, int(np.ceil((VIDEO_SIDE - (2 * one - two)) / (two - one)).max()))
+    if scale is None:
+        rows = np.ceil(np.sqrt(sum(len(shown(subset).views) for subset in subsets)))
+        scale = max(1, int(np.ceil(VIDEO_SIDE / (rows * subsets[0].record.size))))
     return _grid([_subset_frames(subset, scale, frames, episode) for subset in subsets])
 
 
@@ -117,72 +112,41 @@ def _grid(videos: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(rows, axis=1)
 
 
-def write_preview(
-    path: str | Path,
-    out: str | Path | None = None,
-    *,
-    only: Sequence[str] = (),
-    episodes: int = 4,
-    scale: int | None = None,
-    frames: int = VIDEO_FRAMES,
-    episode: int | None = None,
-    video: str | None = None,
-) -> list[Path]:
-    """Write contact_sheet.png and preview.mp4 (or .webp, .gif) of a release.
+@checked
+def write_preview(release: Location, *, only: Names = (), out: Local | None = None, episodes: Count = 4) -> list[Path]:
+    """Write contact_sheet.png and preview.webp of a release.
 
     Args:
-      out: folder of the files; `<release>/preview` by default.
-      only: subset patterns.
-      episodes: number of episodes of each subset on the sheet.
-      scale: enlargement of the images; by default 2 on the sheet, and in the video what makes it 512 pixels or more.
-      frames: number of frames of the video, which has 20 a second.
-      episode: which episode of each subset the video shows; the first by default.
-      video: "mp4", "webp" or "gif"; by default mp4 if imageio-ffmpeg is installed, else webp.
+      release (RELEASE): Folder of the release.
+      only (PATTERN): Show only these subsets.
+      out (FOLDER): Output folder. [default: RELEASE/preview]
+      episodes: Episodes per subset on the sheet; the video shows the first of each.
 
     Returns:
       The files.
 
     Raises:
-      StoreError: the release has no episodes yet, or the folder cannot be written.
-      UnknownNameError: no such kind of video.
+      StoreError: the release has no episodes with images yet, or the folder cannot be written.
     """
-    kind = video or ("mp4" if installed("imageio_ffmpeg") else "webp")
-    if kind not in FORMATS:
-        raise UnknownNameError("kind of video", kind, FORMATS)
-    target = local_path(out) if out else None
-    release = Release.open(path)
-    names = select(list(release.subsets), list(only)) if release.subsets else []
-    subsets = [release.subsets[name] for name in names if release.subsets[name].pixel_arrays]
+    opened = Release.open(release)
+    names = select(list(opened.subsets), as_names(only)) if opened.subsets else []
+    subsets = [opened.subsets[name] for name in names if opened.subsets[name].pixel_arrays]
     if not subsets:
-        cure = f"see which episodes exist: dmcvb-gen verify {quoted(path)}"
+        cure = f"see which episodes exist: dmcvb-gen verify {quoted(release)}"
         if names:
-            cure = f"add them: dmcvb-gen paint {quoted(path)}, or see it without: dmcvb-gen view {quoted(path)}"
-        raise StoreError(f"{path} has no finished episodes with images; {cure}")
-    folder = target or release.path / "preview"
-    picture = Image.fromarray(contact_sheet(subsets, episodes, scale=scale or SHEET_SCALE))
+            cure = f"add them: dmcvb-gen paint {quoted(release)}, or see it without: dmcvb-gen view {quoted(release)}"
+        raise StoreError(f"{release} has no finished episodes with images; {cure}")
+    folder = Path(out or opened.path / "preview")
+    sheet, video = folder / "contact_sheet.png", folder / "preview.webp"
+    picture = Image.fromarray(contact_sheet(subsets, episodes))
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
-        sheet = folder / "contact_sheet.png"
         picture.save(sheet)
-        moving = folder / f"preview.{kind}"
-        (_write_mp4 if kind == "mp4" else _write_animation)(moving, video_frames(subsets, scale, frames, episode))
-    return [sheet, moving]
+        save_video(video, video_frames(subsets))
+    return [sheet, video]
 
 
-def _write_animation(path: Path, frames: np.ndarray) -> None:
-    """(frame, height, width, 3) uint8 as a WebP or GIF."""
-    first, *rest = [Image.fromarray(frame) for frame in frames]
-    options: dict[str, Any] = {"quality": 60, "method": 5} if path.suffix == ".webp" else {}
-    first.save(path, save_all=True, append_images=rest, duration=1000 // VIDEO_FPS, loop=0, **options)
-
-
-def _write_mp4(path: Path, frames: np.ndarray) -> None:
-    import imageio_ffmpeg
-
-    even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)))
-    size = even.shape[2], even.shape[1]
-    encoder = imageio_ffmpeg.write_frames(str(path), size, fps=VIDEO_FPS, quality=8, macro_block_size=2)
-    encoder.send(None)
-    for frame in even:
-        encoder.send(np.ascontiguousarray(frame))
-    encoder.close()
+def save_video(path: Path, frames: np.ndarray) -> None:
+    """Write (frame, height, width, 3) uint8 as a WebP."""
+    first, *rest = map(Image.fromarray, frames)
+    first.save(path, save_all=True, append_images=rest, duration=1000 // VIDEO_FPS, loop=0, quality=60, method=5)

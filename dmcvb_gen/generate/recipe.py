@@ -377,27 +377,8 @@ def make_recipe(data: dict[str, Any], where: str = "recipe") -> Recipe:
     except pydantic.ValidationError as error:
         # A misspelt field is why another one is missing, so it comes first.
         first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-        place = ".".join(map(str, first["loc"])) or "the top"
-        raise RecipeError(f"{where}: {place}: {_cure(first)}") from None
-
-
-CURES = {
-    "missing": "is missing",
-    "tuple_type": "give a list; each entry begins with '- '",
-    "string_type": 'give text; quote what looks like a number, e.g. "1.0.0"',
-}
-"""Kind of a pydantic error -> what to write instead."""
-
-
-def _cure(error: Mapping[str, Any]) -> str:
-    """The cure for a wrong field of a recipe, in words."""
-    place, kind = error["loc"], error["type"]
-    if kind == "extra_forbidden":
-        model = Recipe if len(place) == 1 else SubsetPattern if place[0] == "subsets" else RendererChoice
-        return str(UnknownNameError("field", place[-1], model.model_fields))
-    if kind == "string_pattern_mismatch":
-        return 'give three numbers, e.g. "1.0.0"' if place == ("version",) else "give letters, digits, '.', '_' or '-'"
-    if kind == "model_type":
-        fields = "backend: native" if place[0] == "renderer" else "tasks, levels, settings and episodes"
-        return f"give fields on lines of their own: {fields}"
-    return CURES.get(kind, error["msg"])
+        place, told = first["loc"], first["msg"]
+        if first["type"] == "extra_forbidden":
+            model = Recipe if len(place) == 1 else SubsetPattern if place[0] == "subsets" else RendererChoice
+            told = str(UnknownNameError("field", place[-1], model.model_fields))
+        raise RecipeError(f"{where}: {'.'.join(map(str, place)) or 'the top'}: {told}") from None

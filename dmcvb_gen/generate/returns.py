@@ -7,9 +7,8 @@ from typing import Annotated, Any
 from annotated_types import Ge
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Local, Location, Names, Seed, checked
-from dmcvb_gen.spec import Level, is_maze, task_folder
-from dmcvb_gen.storage.places import local_path
+from dmcvb_gen.options import Location, Names, Seed, checked
+from dmcvb_gen.spec import Level
 from dmcvb_gen.text import as_names
 
 
@@ -22,7 +21,6 @@ def evaluate_behaviour(
     episodes: Annotated[int, Ge(2)] = 100,
     seed: Seed = 1,
     sample: bool = False,
-    pictures: Local | None = None,
 ) -> list[dict[str, Any]]:
     """Measure the returns of behaviour policies over fresh episodes, beside the paper's.
 
@@ -33,7 +31,6 @@ def evaluate_behaviour(
       episodes: Fresh episodes of each policy.
       seed: Random seed of the episodes.
       sample: Sample actions instead of using the policy mean.
-      pictures (FOLDER): Folder for drawings of ten paths in each maze.
 
     Returns:
       A row for each task and level: task, level, episodes, seed, mode ("mean", "sampled", or "own" if a function of
@@ -41,29 +38,25 @@ def evaluate_behaviour(
       success, speed and running_speed (m/s) too.
 
     Raises:
-      DmcvbError: an unknown name, a policy that does not fit, an option without effect, or pictures of tasks that are
-        no mazes.
+      DmcvbError: an unknown name, or a policy that does not fit.
     """
     from dmcvb_gen.generate.info import return_statistics  # here, so that --help is quick
     from dmcvb_gen.generate.request import behaviour_source
     from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.bundled import bundled_levels
-    from dmcvb_gen.policies.evaluation import maze_scores, running_speed, walked_paths
+    from dmcvb_gen.policies.evaluation import maze_scores, running_speed
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.policies.simulate import simulate
     from dmcvb_gen.tasks import get_task, task_ids
-    from dmcvb_gen.tasks.ant_maze.picture import save_paths_picture
 
     behaviour = behaviour_source(behaviour)
-    _check_levels(as_names(levels), behaviour, sample)
+    for level in as_names(levels):
+        Level.parse(level)
     chosen, asked = _of_behaviour(behaviour, as_names(tasks), as_names(levels)) if behaviour else (tasks, levels)
     chosen = as_names(chosen) or tuple(task_id for task_id in task_ids() if bundled_levels(task_id))
-    folder = None if pictures is None else local_path(pictures)
-    if folder and not any(map(is_maze, chosen)):
-        raise DmcvbError(f"--pictures shows the paths of mazes, and {', '.join(chosen)} is not a maze; remove it")
     rows = []
     for task_id in chosen:
-        task, panels = get_task(task_id), {}
+        task = get_task(task_id)
         for level in as_names(asked) or (*bundled_levels(task_id), "random"):
             policies = _policies(task_id, level, behaviour)
             out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
@@ -74,22 +67,8 @@ def evaluate_behaviour(
             success, speed = maze_scores(task, out)
             if success is not None:
                 row |= dict(success=success, speed=speed, running_speed=running_speed(task, out))
-                panels[f"{level}, {success:.0%} at the goal"] = walked_paths(task, out)
             rows.append(row | dict(paper=paper_returns(task_id, level)))
-        if folder and panels:
-            save_paths_picture(task.layout, panels, folder / f"{task_folder(task_id)}.png")  # type: ignore[attr-defined]
     return rows
-
-
-def _check_levels(levels: Sequence[str], behaviour: str | None, sample: bool) -> None:
-    for level in levels:
-        Level.parse(level)
-    if set(levels) != {Level.RANDOM}:
-        return
-    if behaviour:
-        raise DmcvbError("--behaviour has no effect here: level random has no policy; ask for another, or remove it")
-    if sample:
-        raise DmcvbError("--sample has no effect here: level random is always drawn; ask for another, or remove it")
 
 
 def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:

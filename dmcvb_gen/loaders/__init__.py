@@ -21,8 +21,7 @@ _HOMES = {
     "StreamDataset": "torch_data",
     "DistractedEnv": "envs",
     "DistractedVectorEnv": "envs",
-    "data_layout": "layout",
-    "matching_environment": "layout",
+    "matching_environment": "matching",
 }
 
 __all__ = sorted(_HOMES)

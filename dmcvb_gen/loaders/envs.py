@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from typing import Annotated, Any, Literal, SupportsFloat
 
 import gymnasium
@@ -23,7 +22,7 @@ from numpy.typing import ArrayLike
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
-from dmcvb_gen.errors import BackgroundError, DmcvbError, UnknownNameError
+from dmcvb_gen.errors import BackgroundError, DmcvbError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look
 from dmcvb_gen.rendering import make_renderer
@@ -64,6 +63,7 @@ class Scene:
       backgrounds: "builtin" or a folder of videos.
       own_videos: digest of the videos of the data, if these are not the built-in ones; then give `backgrounds`.
       views: pictures of a task that has several (mazes), side by side in the channels; all by default.
+      stack: frames a stack, laid out as readers give them; one frame with its channels last by default.
       modalities: names of modalities that observations have too, e.g. "depth" and "parts"; see `generate.modalities`.
       action_repeat: control steps for which an action is held; give that of the data.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
@@ -83,6 +83,7 @@ class Scene:
     backgrounds: str = "builtin"
     own_videos: str | None = None
     views: str | Sequence[str] | None = None
+    stack: Count | None = None
     modalities: str | Sequence[str] = ()
     action_repeat: Literal[1, 2, 4] = 2
     max_steps: Count | None = None
@@ -104,8 +105,7 @@ class Scene:
 
     def check(self) -> None:
         """Raises DmcvbError for a field that has no effect, or none for this task."""
-        spec, given = self.spec(), {name for name in _FIELDS if getattr(self, name) != getattr(Scene, name)}
-        unused = []
+        spec, unused = self.spec(), []
         if not is_maze(get_task(self.task).id):
             unused.append("goal")
         if spec.goal is not GoalMode.FIXED:
@@ -115,7 +115,7 @@ class Scene:
         if spec.distractor.kind == "none":
             unused.append("backgrounds")
         for name in unused:
-            if name in given:
+            if getattr(self, name) != getattr(Scene, name):
                 raise DmcvbError(f"{name} has no effect on {self.task} {self.distractor}; remove {name}")
         if self.views is not None and not len(self.views):
             raise DmcvbError("views is empty; leave it out for all of them")
@@ -145,13 +145,7 @@ class Scene:
             )
 
 
-_FIELDS = [field.name for field in fields(Scene) if field.name not in ("task", "distractor")]
-
-
 def _scene(task: str, distractor: str, options: Mapping[str, Any]) -> Scene:
-    for name in options:
-        if name not in _FIELDS:
-            raise UnknownNameError("option of environments", name, _FIELDS)
     try:
         scene = Scene(task, distractor, **options)
     except pydantic.ValidationError as error:
@@ -194,10 +188,15 @@ class _Stage:
         self.action = np.zeros((count, self.task.action_size))  # the last one
         self.state = np.zeros((count, self.task.state_size))
         self.goal_pair = np.full(count, -1)
+        self.picture: np.ndarray | None = None  # (place, size, size, 3 * view), the last one
+        self.stack, channels = scene.stack, 3 * len(self.pictures.views)
+        self._frames = np.zeros((count, scene.stack or 1, channels, self.size, self.size), np.uint8)
+        self._is_first = np.zeros(count, bool)
 
     def spaces(self) -> tuple[spaces.Dict, spaces.Box]:
         """Spaces of one place: observations {"pixels", "state"} and modalities, and actions."""
-        shape = (self.size, self.size, 3 * len(self.pictures.views))
+        channels = 3 * len(self.pictures.views)
+        shape = (self.stack * channels, self.size, self.size) if self.stack else (self.size, self.size, channels)
         observation: dict[str, spaces.Space] = {
             "pixels": spaces.Box(0, 255, shape, np.uint8),
             "state": spaces.Box(-np.inf, np.inf, (self.task.state_size,), np.float32),
@@ -220,7 +219,7 @@ class _Stage:
             if self.pairs:
                 self.goal_pair[place] = self._first_pair + number % len(self.pairs)
             self.started[place] += 1
-            self.frame[place], self.action[place] = 0, 0
+            self.frame[place], self.action[place], self._is_first[place] = 0, 0, True
         streams = {
             name: [episode_stream(seed, (self.task.id, PURPOSE), number, name) for seed, number in self._episodes]
             for name in STREAMS
@@ -245,18 +244,27 @@ class _Stage:
         )
 
     def observe(self) -> dict[str, np.ndarray]:
-        """ "pixels" (place, size, size, 3 * view) uint8, "state" (place, state) float32, modalities (place, size, size,
-        view)."""
+        """ "pixels" (place, size, size, 3 * view) uint8 or stacked, "state" (place, state) float32, modalities (place,
+        size, size, view)."""
         physics, shown = self.batch.physics(), self.pictures
         labels = self.labels(physics)
         pictures = self.renderer.render(physics, labels, shown.views, shown.hide_goal)  # (place, view, size, size, 3)
-        pixels = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
+        self.picture = np.moveaxis(pictures, 1, 3).reshape(self.count, self.size, self.size, -1)
+        pixels = self._stacked(self.picture) if self.stack else self.picture
         observation = {"pixels": pixels, "state": self.state.astype(np.float32)}
         if self.modalities:
             seen = look(self.renderer, physics, labels, shown.views, shown.hide_goal)
             for modality in map(get_modality, self.modalities):
                 observation[modality.name] = np.stack([modality.compute(view) for view in seen], axis=3)
         return observation
+
+    def _stacked(self, pixels: np.ndarray) -> np.ndarray:
+        """(place, stack * 3 * view, size, size): the last frames, the oldest first; an episode's first is repeated."""
+        channels = np.moveaxis(pixels, -1, 1)
+        self._frames = np.concatenate([self._frames[:, 1:], channels[:, None]], axis=1)
+        self._frames[self._is_first] = channels[self._is_first, None]
+        self._is_first[:] = False
+        return self._frames.reshape(self.count, -1, self.size, self.size).copy()
 
     def step(self, actions: ArrayLike, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rewards, terminated, truncated of one agent step of the active places.
@@ -297,7 +305,8 @@ def _pairs(task: Task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, i
 class DistractedEnv(gymnasium.Env):
     """One episode at a time.
 
-    Observations are {"pixels": (size, size, 3 * views) uint8, "state": (state,) float32}; an action (action,) in
+    Observations are {"pixels": (size, size, 3 * views) uint8, or (stack * views * 3, size, size), "state": (state,)
+    float32}; an action (action,) in
     the task's bounds, [-1, 1] for most, is held for `action_repeat` control steps, whose rewards are summed (an episode
     earns at most 1000). The seed of `reset` decides initial states, distractors and all episodes after it.
 
@@ -322,7 +331,6 @@ class DistractedEnv(gymnasium.Env):
         self.metadata = self.metadata | {"render_fps": round(1 / self.task.seconds_per_step)}
         self._seed: int | None = None
         self._ended = False
-        self._pixels: np.ndarray | None = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
         super().reset(seed=seed)
@@ -342,18 +350,16 @@ class DistractedEnv(gymnasium.Env):
         return self._observation(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info()
 
     def _observation(self) -> dict[str, np.ndarray]:
-        observation = {name: value[0] for name, value in self._stage.observe().items()}
-        self._pixels = observation["pixels"]
-        return observation
+        return {name: value[0] for name, value in self._stage.observe().items()}
 
     def _info(self) -> dict[str, int]:
         return {name: int(values[0]) for name, values in self._stage.info().items()}
 
     def render(self) -> np.ndarray | None:
         """The picture of the current frame (its first view), (size, size, 3) uint8."""
-        if self.render_mode is None or self._pixels is None:
+        if self.render_mode is None or self._stage.picture is None:
             return None
-        return self._pixels[..., :3].copy()
+        return self._stage.picture[0, ..., :3].copy()
 
     def close(self) -> None:
         self._stage.renderer.close()

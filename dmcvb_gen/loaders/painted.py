@@ -7,7 +7,6 @@ colors, before other videos, all drawn from named streams: augmentation that kee
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -22,7 +21,7 @@ from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.reader import StoredArray
 from dmcvb_gen.distractor_state import DistractorState
-from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
@@ -32,8 +31,7 @@ from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
 from dmcvb_gen.tasks import get_task
 
-STORED, RESAMPLED = "stored", "resample"
-DISTRACTORS = (STORED, RESAMPLED)
+STORED, RESAMPLED = DISTRACTORS = ("stored", "resample")
 """Labels to paint with: those of the data, or fresh ones for every epoch."""
 DEFAULT_CACHE = 1_000_000_000
 """Bytes of painted episodes that a subset keeps."""
@@ -267,12 +265,8 @@ def open_painted(
 
     Raises:
       StoreError: there is no release, it cannot be read, or it was imported.
-      UnknownNameError: `painting` has an unknown field.
+      TypeError: `painting` has an unknown field.
     """
-    known = [field.name for field in dataclasses.fields(Painting)]
-    for name in painting:
-        if name not in known:
-            raise UnknownNameError("option of painting", name, known)
     return painted_release(Release.open(path, storage_options, digest), Painting(**painting))
 
 

@@ -82,7 +82,7 @@ def register_with_gymnasium() -> None:
 
 
 class _GymnasiumFinder:
-    """Finds `gymnasium` as the other finders do, once, with a loader that calls `register` afterwards."""
+    """Finds `gymnasium` as the other finders do, once, and calls `register` after it was loaded."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if fullname != "gymnasium":
@@ -90,23 +90,11 @@ class _GymnasiumFinder:
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(fullname)
         if spec is not None and spec.loader is not None:
-            loader: Any = _RegisteringLoader(spec.loader)
-            spec.loader = loader
+            load = spec.loader.exec_module
+
+            def load_and_register(module: ModuleType) -> None:
+                load(module)
+                register()
+
+            spec.loader.exec_module = load_and_register  # type: ignore[method-assign]
         return spec
-
-
-class _RegisteringLoader:
-    """Another loader, and `register` after it."""
-
-    def __init__(self, loader: Any):
-        self._loader = loader
-
-    def __getattr__(self, name: str) -> Any:  # get_source, get_data, ...
-        return getattr(self._loader, name)
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        return self._loader.create_module(spec)
-
-    def exec_module(self, module: ModuleType) -> None:
-        self._loader.exec_module(module)
-        register()

@@ -8,7 +8,6 @@ costs a tenth of reading single frame stacks.
 
 from __future__ import annotations
 
-import itertools
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
@@ -31,15 +30,11 @@ Views = Sequence[str] | Literal["agents"] | None
 `dmcvb_gen.evaluate` gives, which are all but the overhead view of mazes; (): states alone."""
 
 
-def check_count(name: str, value: int, least: int = 1) -> int:
-    """Return `value` if it is a whole number, and at least so large.
-
-    Raises:
-      DmcvbError: it is not.
-    """
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise DmcvbError(f"{name} is {value!r}; give a whole number of at least {least}")
-    return int(value)
+def _check_counts(**counts: int) -> None:
+    """Raises DmcvbError for a number below 1."""
+    for name, value in counts.items():
+        if value < 1:
+            raise DmcvbError(f"{name} is {value}; give a whole number of at least 1")
 
 
 class StepSource:
@@ -71,7 +66,8 @@ class StepSource:
         next_step: bool = False,
         in_memory: bool | None = None,
     ):
-        self.subset, self.stack, self.next_step = subset, check_count("stack", stack), next_step
+        _check_counts(stack=stack)
+        self.subset, self.stack, self.next_step = subset, stack, next_step
         self.pictures = shown(subset, pictures).arrays
         self.episodes = subset.choose(episodes)
         lengths = subset.read("length", self.episodes)
@@ -146,8 +142,6 @@ def stream(
     seed: int = 0,
     epoch: int = 0,
     buffer: int = 32,
-    rank: int = 0,
-    world: int = 1,
     worker: int = 0,
     workers: int = 1,
     drop_last: bool = False,
@@ -159,70 +153,29 @@ def stream(
       episodes, pictures, stack, next_step: see `StepSource`.
       shuffle: mix episodes, and steps among the `buffer` episodes in memory; the same for the same seed, epoch and
         number of workers.
-      rank, world, worker, workers: this process's share of the episodes. All ranks give as many batches as the one
-        whose episodes have the fewest steps (mazes' differ in length), so that none waits for another.
+      worker, workers: this worker's share of the episodes.
       drop_last: leave out a batch that is not full.
 
     Raises:
-      DmcvbError: a number that is too small or not whole, or fewer episodes than ranks.
+      DmcvbError: a number that is too small, or no episodes.
     """
-    counts = {"stack": stack, "buffer": buffer, "batch_size": 1 if batch_size is None else batch_size}
-    for name, value in counts.items():
-        check_count(name, value)
-    for name, value in {"seed": seed, "epoch": epoch}.items():
-        check_count(name, value, least=0)
+    _check_counts(stack=stack, buffer=buffer, batch_size=1 if batch_size is None else batch_size)
     names = shown(subset, pictures).arrays
-    order = subset.choose(episodes)
+    own = subset.choose(episodes)
+    if not len(own):
+        raise DmcvbError("no episodes are chosen; give at least one")
     if shuffle:
-        order = np.random.default_rng([seed, epoch, 0]).permutation(order)
-    own, most = share(order, rank, world, worker, workers), None
-    if world > 1:
-        most = _batches(subset, order, batch_size, world, workers, drop_last)[rank][worker]
-    mixer = np.random.default_rng([seed, epoch, 1 + rank * workers + worker]) if shuffle else None
+        own = np.random.default_rng([seed, epoch, 0]).permutation(own)
+    own = own[worker::workers]
+    mixer = np.random.default_rng([seed, epoch, 1 + worker]) if shuffle else None
     tables = (
         StepTable.read([Selection(subset, own[first : first + buffer], names)]) for first in range(0, len(own), buffer)
     )
     parts = (
         (table.gather(rows, stack, next_step), len(rows)) for table, rows in _drawn(tables, mixer, batch_size or 1)
     )
-    for batch in itertools.islice(_joined(parts, batch_size or 1, drop_last), most):
+    for batch in _joined(parts, batch_size or 1, drop_last):
         yield batch if batch_size else {name: value[0] for name, value in batch.items()}
-
-
-def share(episodes: np.ndarray, rank: int, world: int, worker: int = 0, workers: int = 1) -> np.ndarray:
-    """The episodes of one rank and worker; ranks get equally many.
-
-    Raises:
-      DmcvbError: there are fewer episodes than ranks.
-    """
-    if not 0 <= rank < world:
-        raise DmcvbError(f"rank {rank} is not in 0..{world - 1}; give rank < world")
-    if not len(episodes):
-        raise DmcvbError("no episodes are chosen; give at least one")
-    if len(episodes) < world:
-        raise DmcvbError(f"{len(episodes)} episodes cannot be shared by {world} ranks; use fewer ranks")
-    return episodes[: len(episodes) - len(episodes) % world][rank::world][worker::workers]
-
-
-def _batches(
-    subset: Subset, order: np.ndarray, batch_size: int | None, world: int, workers: int, drop_last: bool
-) -> list[list[int]]:
-    """Count the batches of each rank's workers: every rank has as many as the shortest one.
-
-    Of single steps (no batch size), each worker gives as many as that worker of any rank has: a loader that makes
-    batches of them makes them by worker.
-    """
-    lengths = dict(zip(subset.episodes.tolist(), subset.lengths.tolist(), strict=True))
-    counts = []
-    for rank in range(world):
-        shares = [share(order, rank, world, worker, workers) for worker in range(workers)]
-        steps = np.array([sum(lengths[int(episode)] for episode in own) for own in shares])
-        size = batch_size or 1
-        counts.append(steps // size if drop_last else -(-steps // size))
-    if batch_size is None:
-        return [np.min(counts, axis=0).tolist()] * world
-    fewest = min(own.sum() for own in counts)
-    return [np.diff(np.minimum(np.cumsum([0, *own]), fewest)).tolist() for own in counts]
 
 
 def _drawn(

@@ -106,28 +106,24 @@ class EpisodeDataset(_OfEpoch, Dataset):
 
 
 class StreamDataset(_OfEpoch, IterableDataset):
-    """All steps once an epoch, shuffled, read an episode at a time; shared among ranks and loader workers.
+    """All steps once an epoch, shuffled, read an episode at a time; shared among a loader's workers.
 
     Give it to a `DataLoader` with `batch_size=None` when it makes the batches itself (`batch_size` here), and call
-    `set_epoch` before each epoch for another order.
+    `set_epoch` before each epoch for another order. For several ranks of torch.distributed, take a `StepDataset` and
+    torch's `DistributedSampler`.
 
     Args:
       batch_size, episodes, pictures, stack, next_step, shuffle, seed, buffer, drop_last: see `sampler.stream`.
-      rank, world: this process's share; those of torch.distributed by default, if it runs.
     """
 
-    def __init__(self, subset: Subset, *, rank: int | None = None, world: int | None = None, **options: Any):
+    def __init__(self, subset: Subset, **options: Any):
         super().__init__(subset, options.pop("epoch", None))
         self.options = options
-        running = torch.distributed.is_available() and torch.distributed.is_initialized()
-        self.rank = rank if rank is not None else torch.distributed.get_rank() if running else 0
-        self.world = world if world is not None else torch.distributed.get_world_size() if running else 1
 
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
         given = int(self._epoch)  # of the whole pass, though others may read the subset between its batches
         worker = get_worker_info()
-        place: dict[str, Any] = dict(rank=self.rank, world=self.world)
-        place |= dict(worker=worker.id, workers=worker.num_workers) if worker else {}
+        place: dict[str, Any] = dict(worker=worker.id, workers=worker.num_workers) if worker else {}
         items = stream(self.subset, epoch=max(0, given), **place, **self.options)
         while True:
             self._show(given)

@@ -90,13 +90,6 @@ class Needs:
     memory: int | None = None
     gpus: float = 0
 
-    def __str__(self) -> str:
-        """The resources in words, e.g. "2 CPUs, 4.0 GB of memory"."""
-        parts = [f"{self.cpus:g} CPU{'s' * (self.cpus != 1)}"]
-        parts += [f"{self.gpus:g} GPU{'s' * (self.gpus > 1)}"] if self.gpus else []
-        parts += [f"{self.memory / 1e9:.1f} GB of memory"] if self.memory else []
-        return ", ".join(parts)
-
 
 @dataclass(frozen=True)
 class Ray:

@@ -6,7 +6,6 @@ import atexit
 import contextlib
 import multiprocessing
 import os
-import pickle
 import queue
 import signal
 import sys
@@ -148,30 +147,9 @@ def _work(function: Callable, arguments: tuple) -> Any:
     try:
         return function(*arguments, tick=_tell)
     except Exception as error:
-        told = _sendable(error)
-        if told is error:
+        if isinstance(error, DmcvbError) or type(error).__module__ == "builtins":
             raise
-        raise told from error
-
-
-def _sendable(error: BaseException) -> BaseException:
-    """An error that reaches the parent: itself, or one that tells of it if it does not survive pickling.
-
-    The parent would take it for a killed worker.
-    """
-    try:
-        pickle.loads(pickle.dumps(error))  # of this very process; nothing from elsewhere is loaded
-    except Exception:
-        told = DmcvbError(f"a worker failed ({_in_a_line(error)})")
-        told.add_note("".join(traceback.format_exception(error)))
-        return told
-    return error
-
-
-def _in_a_line(error: BaseException) -> str:
-    """Name and text of an error; one that was written wrongly may not even have a text."""
-    name = type(error).__name__
-    try:
-        return f"{name}: {' '.join(str(error).split())}"
-    except Exception:
-        return name
+        # Others may not survive pickling, and the parent would take that for a killed worker.
+        told = RuntimeError(f"a worker failed: {type(error).__name__}: {' '.join(str(error).split())}")
+        told.add_note(traceback.format_exc())
+        raise told from None

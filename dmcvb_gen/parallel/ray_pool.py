@@ -18,8 +18,6 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.own_code import permissions
 from dmcvb_gen.parallel.base import IN_FLIGHT, POLL_SECONDS, Needs, Pool, ProgressCallback, ignore, limit_threads
 
-_log = logging.getLogger(__name__)
-
 
 class RayPool(Pool):
     """One Ray task for each piece of work, repeated if its node is lost; each CPU has `IN_FLIGHT` of them.
@@ -40,7 +38,7 @@ class RayPool(Pool):
         try:
             import ray
         except ImportError:
-            raise DmcvbError("--executor ray needs a package that is not installed: pip install 'ray>=2.40'") from None
+            raise DmcvbError("--workers ray needs a package that is not installed: pip install 'ray>=2.40'") from None
         self._ray, self._tick, self._needs, self._threads = ray, tick, needs or Needs(), threads
         self._ours = not ray.is_initialized()
         if self._ours:
@@ -52,7 +50,6 @@ class RayPool(Pool):
                 raise _nobody(address or "RAY_ADDRESS", reason) from None
         self._waiting: deque = deque()
         self._running: dict[Any, Any] = {}
-        self._told = False
 
     def submit(self, key, function, *arguments):
         self._waiting.append((key, function, arguments))
@@ -67,8 +64,6 @@ class RayPool(Pool):
                 key, function, arguments = self._waiting.popleft()
                 self._running[work.remote(function, arguments, self._threads, tuple(permissions().items()))] = key
             done, _ = ray.wait(list(self._running), num_returns=1, timeout=10 * POLL_SECONDS)
-            if not done:
-                self._tell_if_no_node_fits()
             for reference in done:
                 key = self._running.pop(reference)
                 try:
@@ -78,12 +73,6 @@ class RayPool(Pool):
                 for facts in ticks:
                     self._tick(*facts)
                 yield key, result
-
-    def _tell_if_no_node_fits(self) -> None:
-        """Say once what the work waits for; a node that is added later may have it."""
-        if not self._told and not any(fits(node["Resources"], self._needs) for node in _alive(self._ray.nodes())):
-            self._told = True
-            _log.warning("waiting for a Ray node with %s: no node has that", self._needs)
 
     def memory_each(self):
         if self._needs.memory is None:
@@ -116,23 +105,13 @@ def share_of_node(nodes: Sequence[Mapping[str, Any]], needs: Needs) -> int | Non
       The least share of all nodes where it can be placed; None if there is no such node yet.
     """
     shares = []
-    for resources in (node["Resources"] for node in _alive(nodes)):
+    for resources in (node["Resources"] for node in nodes if node["Alive"]):
         beside = [resources.get("CPU", 0) / needs.cpus]
         if needs.gpus:
             beside.append(resources.get("GPU", 0) / needs.gpus)
         if min(beside) >= 1 and "memory" in resources:
             shares.append(int(resources["memory"] / int(min(beside))))
     return min(shares, default=None)
-
-
-def fits(resources: Mapping[str, float], needs: Needs) -> bool:
-    """Whether a node with these resources, as `ray.nodes()` lists them, can do a piece of work."""
-    asked = {"CPU": needs.cpus, "GPU": needs.gpus, "memory": needs.memory or 0}
-    return all(resources.get(name, 0) >= amount for name, amount in asked.items())
-
-
-def _alive(nodes: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    return [node for node in nodes if node["Alive"]]
 
 
 def _check_answers(address: str | None) -> None:
@@ -148,8 +127,8 @@ def _check_answers(address: str | None) -> None:
 
 def _nobody(address: str, reason: str) -> DmcvbError:
     return DmcvbError(
-        f"no Ray cluster answers at {address} ({reason}); start one with `ray start --head`, or leave --ray-address "
-        "away to work on this machine alone"
+        f"no Ray cluster answers at {address} ({reason}); start one with `ray start --head`, name another in "
+        "RAY_ADDRESS, or give a number of --workers"
     )
 
 

@@ -90,10 +90,3 @@ def running_speed(task: Task, simulation: Simulation) -> float | None:
     moved = np.diff(simulation.state[..., part].astype(np.float64), axis=1)
     taken = np.arange(moved.shape[1]) < simulation.length[:, None]
     return float(np.sqrt((moved[taken] ** 2).sum(axis=1).mean()) / task.seconds_per_step)
-
-
-def walked_paths(task: Task, simulation: Simulation, count: int = 10) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The first episodes' paths, (point, 2), and goals, (2), of a maze: x and y in meters."""
-    place, goal = task.state_slices["walker_position"], task.state_slices["target_position"]
-    states = zip(simulation.state[:count], simulation.length[:count], strict=True)
-    return [(state[: length + 1, place][:, :2], state[0, goal][:2]) for state, length in states]

@@ -106,7 +106,7 @@ def verify(
     """
     if is_url(str(release)):
         threads = THREADS if workers is None else workers
-        refuse("at a URL nothing is rendered or simulated", backgrounds=backgrounds, executor=isinstance(threads, Ray))
+        refuse("at a URL nothing is rendered or simulated", backgrounds=backgrounds, workers=isinstance(threads, Ray))
         with progress_bar(progress, " files", scaled=False) as bar:
             return verify_url(str(release), storage_options, everything, bar, threads)  # type: ignore[arg-type]
     refuse(f"{release} is a folder, which is always read whole", all=everything, option=storage_options)

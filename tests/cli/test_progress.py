@@ -1,7 +1,6 @@
 """Progress: a bar on a terminal and rare lines in a log, that know how much is to come; for both families."""
 
 import contextlib
-import io
 import os
 import re
 import subprocess
@@ -29,14 +28,11 @@ def commands(task, folder):
     yield "paint", folder / "bare"
     yield "verify", release
     yield "validate", release, "--checks-only", "--out", folder / "report"
-    narrow = Release.open(release).manifest.subsets[0].name
-    yield "validate", release, "--checks-only", "--only", narrow, "--workers", "2", "--out", folder / "report"
     yield "regenerate", release, "--check"
     yield "repaint", release, "--size", "32", "--out", folder / "repainted"
     yield "publish", release, f"file:{folder / 'published'}"
     yield "verify", f"file:{folder / 'published'}"
     yield "fetch", f"file:{folder / 'published'}", "--out", folder / "fetched"
-    yield "publish", folder / "bare", f"file:{folder / 'published-bare'}"
     yield "export", release, "--to", "npz", "--out", folder / "exported"
     yield "publish", folder / "exported", f"file:{folder / 'published-export'}"
 
@@ -87,22 +83,6 @@ def test_images_and_scores_are_told_while_cells_train(tmp_path, monkeypatch, tas
     training = [place for place, line in enumerate(told) if re.match(r".*bc.*%\|", line)]
     assert len(scores) == 2 and scores[0] < max(training), told
     assert any(line.startswith(f"images of {task}/") and ", 100%: " in line for line in told), told
-
-
-def test_time_in_which_nothing_can_be_counted_says_nothing_of_the_rate(monkeypatch):
-    monkeypatch.setattr(progress, "LOG_SECONDS", 0)
-    now = [0.0]
-    bar = progress.ProgressBar(total=1000, unit=" steps", file=io.StringIO())
-    monkeypatch.setattr(bar, "_time", lambda: now[0])
-    bar.start_t = bar.last_print_t = 0.0
-    for second in range(100):
-        now[0] = float(second)
-        bar.advance(f"images of walker, {second}%", 0)
-    for second in range(100, 110):
-        now[0] = float(second)
-        bar.advance("bc on walker", 5)
-    assert bar.format_dict["rate"] == pytest.approx(5, rel=0.3) and bar.n == 50
-    bar.close()
 
 
 def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):

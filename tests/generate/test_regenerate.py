@@ -11,9 +11,9 @@ from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
-from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.regenerate import Regeneration
-from tests.conftest import invoke, rewrite, roll_out, small_recipe
+from tests.conftest import invoke, rewrite, roll_out, short_recipe, small_recipe
 
 NAME = "walker-walk/random/dynamic"
 GROUP = "walker-walk/random.zarr"
@@ -30,6 +30,7 @@ def files_of(folder):
     return {name: data for name, data in found.items() if not name.startswith((".", "provenance"))}
 
 
+@pytest.mark.slow_cases("small_mazes")
 @pytest.mark.parametrize("release", ["small_release", "small_mazes"])
 def test_a_check_writes_nothing_and_finds_every_bit_equal(release, request):
     folder = request.getfixturevalue(release)
@@ -117,16 +118,14 @@ def test_a_file_that_comes_out_otherwise_is_not_put_in(copy):
     assert files_of(copy) == before
 
 
-def test_beside_it_makes_an_equal_release_and_goes_on_in_what_has_grown(small_release, tmp_path):
-    part = Regeneration(small_release, ["*/*/none"], (0, 1)).remake(tmp_path / "beside")
+def test_beside_it_makes_an_equal_release_and_goes_on_in_what_has_grown(tmp_path):
+    source = roll_out(short_recipe(), tmp_path / "source")
+    part = Regeneration(source.path, ["*/*/none"], (0, 1)).remake(tmp_path / "beside")
     assert part.sound and {shard.layer.split("/")[-1] for shard in part.shards} == {"trajectories", "labels", "pixels"}
-    assert Regeneration(small_release).remake(tmp_path / "beside").sound
-    assert Release.open(tmp_path / "beside").digest == Release.open(small_release).digest
-    more = small_recipe().model_dump(mode="json")["subsets"][0] | {"episodes": 5}
-    roll_out(small_recipe(subsets=[more]), tmp_path / "beside")
-    assert Regeneration(small_release).remake(tmp_path / "beside").sound
-    with pytest.raises(StoreError, match="remove --out"):
-        Regeneration(small_release).remake(small_release)
+    assert Regeneration(source.path).remake(tmp_path / "beside").sound
+    assert Release.open(tmp_path / "beside").digest == source.digest
+    roll_out(short_recipe(episodes=5), tmp_path / "beside")
+    assert Regeneration(source.path).remake(tmp_path / "beside").sound
 
 
 def test_beside_it_leaves_another_release_alone(small_release, tmp_path):
@@ -135,20 +134,6 @@ def test_beside_it_leaves_another_release_alone(small_release, tmp_path):
     with pytest.raises(StoreError, match="seed 9, asked for 3; choose another --out"):
         Regeneration(small_release).remake(tmp_path / "other")
     assert files_of(tmp_path / "other") == before
-
-
-@pytest.mark.parametrize(
-    ("words", "error", "told"),
-    [
-        (dict(only=["cheetah-run"]), UnknownNameError, "walker-walk/random/none"),
-        (dict(episodes=(7, 9)), StoreError, "no subset has episodes 7:9"),
-    ],
-)
-def test_bad_requests_say_what_to_do(small_release, tmp_path, words, error, told):
-    with pytest.raises(error, match=told):
-        Regeneration(small_release, **words).check()
-    with pytest.raises(StoreError, match="holds no release"):
-        Regeneration(tmp_path).check()
 
 
 def test_videos_and_policies_that_are_lost_are_put_back(tmp_path):
@@ -167,15 +152,3 @@ def test_videos_and_policies_that_are_lost_are_put_back(tmp_path):
     assert result.exit_code == 0 and "restored 3 other files" in result.output, result.output
     assert files_of(tmp_path / "r") == before
     assert "no shard is damaged" in invoke(*command).output
-
-
-@pytest.mark.parametrize("arguments, cure", [
-    ([], "give a RELEASE"),
-    (["r", "--manifest", __file__], "give a RELEASE"),
-    (["--manifest", __file__], "add --out"),
-    (["--manifest", "quickstart", "--check"], "remove --check"),
-    (["r", "--check", "--out", "x"], "not both"),
-])  # fmt: skip
-def test_a_manifest_and_a_release_are_not_mixed_up(arguments, cure):
-    result = invoke("regenerate", *arguments)
-    assert result.exit_code == 2 and cure in result.output

@@ -76,13 +76,6 @@ def test_a_wrong_or_damaged_archive_is_refused_in_one_line(tmp_path, content):
     assert len(done.output.splitlines()) == 1 and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("given", "message"), [("quickstrat", "unknown manifest"), ("no/m.json.xz", "is no file")])
-def test_other_manifests_are_refused_in_one_line(given, message, tmp_path):
-    done = run("--manifest", given, "--out", tmp_path / "out")
-    assert done.exit_code == 2 and message in done.output and len(done.output.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_info_names_the_shipped_release_of_the_same_digest(small_release, monkeypatch):
     release, other = Release.open(small_release), load_shipped("quickstart")
     monkeypatch.setattr("dmcvb_gen.generate.shipped.shipped_manifests", lambda: [release.manifest.name])

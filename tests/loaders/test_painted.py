@@ -127,31 +127,6 @@ def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(made
     assert not np.array_equal(first[0], second[0]) and np.array_equal(first[0], third[0])
 
 
-@pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
-def test_each_data_set_shows_the_epoch_that_it_was_given(made, kind):
-    opened = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")
-    subset = distracted(opened)
-    options = {"episodes": [int(subset.episodes[0])]}
-    if kind == "stream":
-        options |= {"batch_size": 4, "shuffle": False}
-
-    def pictures(data):
-        items = data if kind == "stream" else [data[index] for index in range(len(data))]
-        return np.concatenate([np.ravel(item["pixels"].numpy()) for item in items])
-
-    sets, wanted = [subset.torch(kind, **options) for _ in range(2)], []
-    for epoch in (1, 2):
-        subset.set_epoch(epoch)
-        wanted.append(pictures(sets[0]))  # given none, it shows the subset's
-    for data, epoch in zip(sets, (1, 2), strict=True):
-        data.set_epoch(epoch)
-    assert [np.array_equal(pictures(data), want) for data, want in zip(sets, wanted, strict=True)] == [True, True]
-    assert np.array_equal(pictures(sets[0]), wanted[0]) and not np.array_equal(*wanted)
-    if kind == "stream":
-        subset.set_epoch(0)
-        assert np.array_equal(pictures(subset.torch(kind, epoch=2, **options)), wanted[1])
-
-
 @pytest.mark.slow_cases("maze")
 def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
     subset = distracted(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample"))
@@ -187,3 +162,5 @@ def test_painted_episodes_are_kept_while_there_is_room(made):
 def test_a_way_of_painting_that_there_is_not_is_refused(made):
     with pytest.raises(DmcvbError, match="resample"):
         dmcvb_gen.open(str(made / "light"), paint=True, distractors="new")
+    with pytest.raises(TypeError, match="distractor"):
+        dmcvb_gen.open(str(made / "light"), paint=True, distractor="resample")

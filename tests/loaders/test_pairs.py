@@ -39,6 +39,7 @@ def by_step(batches):
     return {(int(episode), int(step)): np.asarray(pixels) for rows in each for episode, step, pixels in rows}
 
 
+@pytest.mark.slow_cases("ant-maze-tiny-light", "ant-maze-tiny-whole")
 @pytest.mark.parametrize("which", ["whole", "light"])
 def test_a_pair_shows_each_state_under_both_settings_in_every_form(made, which):
     folder, names = made

@@ -149,7 +149,7 @@ def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(small_release, maz
 
 
 def test_the_command_writes_and_refuses(small_release, tmp_path):
-    command = ["view", str(small_release), "--no-open", "--only", "*/none", "--episodes", "1", "--size", "24"]
+    command = ["view", str(small_release), "--only", "*/none", "--episodes", "1", "--size", "24"]
     result = CliRunner().invoke(main, [*command, "--out", str(tmp_path / "v.html")])
     assert result.exit_code == 0 and "1 episode of 1 subset" in result.output
     data = re.search(r'id="data">(.*?)</script>', (tmp_path / "v.html").read_text())[1]

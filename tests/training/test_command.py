@@ -59,16 +59,8 @@ def test_running_speed_counts_every_step_of_every_episode():
     assert running_speed(get_task("walker-walk"), None) is None
 
 
-@pytest.mark.slow
-def test_paths_of_a_maze_are_painted(tmp_path):
-    arguments = ("ant-maze-easy7x7a", "walker-walk", "--level", "random", "--episodes", 2, "--pictures", tmp_path / "p")
-    assert "rms m/s" in evaluated(*arguments)
-    assert [path.name for path in (tmp_path / "p").iterdir()] == ["ant-maze-easy7x7a.png"]
-
-
 def test_what_goes_unheard_or_is_not_there_is_refused_before_any_work(tmp_path):
     for arguments, words in (
-        (["evaluate-behaviour", "walker-walk", "--pictures", tmp_path / "p"], "and walker-walk is not a maze"),
         (["evaluate-behaviour", "walker-walk", "--level", "exprt"], "unknown level 'exprt'. Did you mean 'expert'?"),
         (["evaluate-behaviour", "--behaviour", tmp_path / "nothere"], "neither a policy file, a run folder nor"),
         (["train-behaviour", "walker-walk", "--resume", "--out", tmp_path / "none"], "holds no run to resume"),

@@ -79,10 +79,6 @@ class Modality(abc.ABC):
     def color(self, values: np.ndarray) -> np.ndarray:
         """(..., height, width, *shape) values -> (..., height, width, 3) uint8, for formats that know images alone."""
 
-    @abc.abstractmethod
-    def uncolor(self, images: np.ndarray) -> np.ndarray:
-        """Read the values back from `color`'s images, as well as 8 bits hold them."""
-
 
 _registry: Registry[Modality] = Registry("modality", "dmcvb_gen.generate.modalities", "dmcvb_gen.modalities")
 

@@ -27,7 +27,3 @@ class Depth(Modality):
     def color(self, values):
         grey = np.where(values > 0, np.rint(255 / (1 + np.maximum(values, 0) / SCALE)), 0)
         return np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8)
-
-    def uncolor(self, images):
-        grey = images[..., 0].astype(np.float32)
-        return np.where(grey > 0, SCALE * (255 / np.maximum(grey, 1) - 1), 0).astype(np.float32)

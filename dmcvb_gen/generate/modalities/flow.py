@@ -50,9 +50,6 @@ class Flow(Modality):
         moved = np.clip(np.rint(128 + values / STEP), 0, 255)
         return np.concatenate([moved, np.full((*moved.shape[:-1], 1), 128)], axis=-1).astype(np.uint8)
 
-    def uncolor(self, images):
-        return ((images[..., :2].astype(np.float32) - 128) * STEP).astype(np.float32)
-
 
 def _rays(task: Task, view: int, size: int) -> tuple[float, np.ndarray]:
     """Slope of the picture's edge, and the rays through the middles of pixels: (size, size, 3), at depth 1."""

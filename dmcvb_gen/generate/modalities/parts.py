@@ -33,10 +33,6 @@ class Parts(Modality):
     def color(self, values):
         return COLORS[values]
 
-    def uncolor(self, images):
-        distance = np.abs(images[..., None, :].astype(np.int16) - COLORS).sum(axis=-1)
-        return distance.argmin(axis=-1).astype(np.uint8)
-
 
 @functools.lru_cache(maxsize=8)
 def parts_of(task: Task) -> np.ndarray:

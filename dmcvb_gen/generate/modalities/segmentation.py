@@ -23,7 +23,3 @@ class Segmentation(Modality):
     def color(self, values):
         code = (values.astype(np.int64) + 1) * FACTOR % 2**24
         return np.stack([code >> 16, code >> 8 & 255, code & 255], axis=-1).astype(np.uint8)
-
-    def uncolor(self, images):
-        code = (images.astype(np.int64) * [65536, 256, 1]).sum(axis=-1)
-        return (code * pow(FACTOR, -1, 2**24) % 2**24 - 1).astype(np.int16)

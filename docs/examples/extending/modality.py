@@ -18,6 +18,3 @@ class Near(Modality):
 
     def color(self, values):
         return np.repeat(values[..., None] * np.uint8(255), 3, axis=-1)
-
-    def uncolor(self, images):
-        return (images[..., 0] > 127).astype(np.uint8)

@@ -93,7 +93,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
     import gymnasium
     from gymnasium.envs.registration import EnvSpec
 
-    from dmcvb_gen.loaders.layout import environment_options
+    from dmcvb_gen.loaders.matching import environment_options
 
     record = source.subset.record
     setting = record.setting if record.goal_mode else record.distractor.kind
@@ -107,7 +107,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
 
 def _about_videos(source: Source) -> str:
     """A sentence about videos that the package does not bring, without their folder on this machine."""
-    from dmcvb_gen.loaders.layout import own_videos
+    from dmcvb_gen.loaders.matching import own_videos
 
     videos = own_videos(source.subset)
     return f"; with its videos: recover_environment(backgrounds=FOLDER), the release's {videos}" if videos else ""

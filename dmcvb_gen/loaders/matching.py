@@ -1,0 +1,62 @@
+"""Environments that match a subset, so that a policy trained on its data sees the same layout: stacks, size, videos."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.generate.inputs import BUILTIN, video_source
+from dmcvb_gen.loaders.envs import DistractedEnv, DistractedVectorEnv
+from dmcvb_gen.spec import FIXED, HIDDEN, VISIBLE
+from dmcvb_gen.tasks import ACTION_REPEAT
+
+
+def matching_environment(
+    subset: Subset, stack: int = 3, split: str = "val", num_envs: int | None = None, **options: Any
+) -> DistractedEnv | DistractedVectorEnv:
+    """See `SubsetReader.environment`."""
+    given = environment_options(subset, split) | {"stack": stack}
+    if own_videos(subset):
+        given["backgrounds"] = video_source(subset.release.path, subset.record)
+    given |= options
+    return DistractedEnv(**given) if num_envs is None else DistractedVectorEnv(num_envs, **given)
+
+
+def environment_options(subset: Subset, split: str) -> dict[str, Any]:
+    """Options of `DistractedEnv` that match a subset: setting, size, renderer, views, time limit, pairs of goals.
+
+    Episodes are cut where the data's are, and so compare with the reference scores.
+
+    Args:
+      split: videos and styles: the data's own ("train"), or those kept for evaluation ("val").
+    """
+    record, maze = subset.record, subset.record.goal_mode is not None
+    options: dict[str, Any] = {
+        "task": record.task,
+        "distractor": record.setting if maze else record.distractor.name,
+        "size": record.size,
+        "samples": record.renderer.get("samples"),
+        "split": split,
+        "max_steps": record.max_steps,
+    }
+    if record.action_repeat != ACTION_REPEAT:
+        options["action_repeat"] = record.action_repeat
+    if record.renderer.get("name") and not record.imported:
+        options["renderer"] = record.renderer["name"]
+    if maze:
+        options["views"] = list(shown(subset).views)
+        if record.hidden_goal != (record.setting != VISIBLE):  # `paint --goal` decides it, too
+            options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
+    if own_videos(subset):
+        options["own_videos"] = (record.backgrounds or {}).get("digest")
+    if record.setting == FIXED:
+        seed = int(subset.trajectories.makes.get("seed", 0))
+        options |= {"fixed_goals": record.fixed_goals, "goal_seed": seed}
+    return options
+
+
+def own_videos(subset: Subset) -> str | None:
+    """The folder of a release's own videos; None if a subset shows the built-in ones or none."""
+    videos = (subset.record.backgrounds or {}).get("source", BUILTIN)
+    return None if videos == BUILTIN else videos

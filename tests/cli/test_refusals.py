@@ -1,0 +1,192 @@
+"""Mistakes: one line that names the cure, exit code 2, and nothing written."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+import dmcvb_gen
+from dmcvb_gen.cli.common import parse_options
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.options import with_parameters
+from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from tests.conftest import TINY_MAZE, invoke
+
+MAZE = "ant-maze-empty7x7"
+ROLLOUTS = [
+    ("", "give TASKs or --recipe"),
+    ("walker-fly", "walker-walk"),
+    ("walker-wlk", "Did you mean 'walker-walk'?"),
+    ("walker-walk --level master", "expert"),
+    ("walker-walk --level expert,medium", "unknown level 'expert,medium'"),
+    (f"{TINY_MAZE} --level randm", "Did you mean 'random'?"),
+    ("walker-walk --distractor fog", "dynamic"),
+    ("walker-walk --distracter none", "Did you mean '--distractor'?"),
+    ("walker-walk --size 0", "8 to 1024"),
+    ("walker-walk --samples 3", "samples: Input should be 1, 2, 4 or 8"),
+    ("walker-walk --renderer povray", "opengl"),
+    ("walker-walk --episodes 2 --steps 9", "give --episodes or --steps, not both"),
+    ("walker-walk --range 5:2", "A < B"),
+    ("walker-walk --range ²:³", "A < B"),
+    ("walker-walk --seed", "--seed"),
+    ("walker-walk --workers 0", "x>=1"),
+    ("walker-walk --option a=b", "is a folder"),
+    ("walker-walk --distractor static --backgrounds empty", "holds no videos"),
+    ("walker-walk --distractor static --backgrounds broken", "bad.mp4"),
+    ("walker-walk --behaviour", "--behaviour"),
+    ("walker-walk --behaviour truncated.safetensors", "not a whole policy file"),
+    ("walker-walk --behaviour nan.safetensors", "not finite"),
+    ("cheetah-run --behaviour walker.safetensors", "not for cheetah-run"),
+    ("walker-walk --behaviour mine.py", "give --behaviour mine:FUNCTION"),
+    ("walker-walk --behaviour mine.py:swing", "give --behaviour mine:swing"),
+    ("--recipe no-such-recipe", "dmcvb-mini"),
+    ("--recipe dmcvb-mni", "Did you mean 'dmcvb-mini'?"),
+    ("--zzz", "`dmcvb-gen rollout --help` lists the options"),
+    ("hole.txt", "hole"),
+    ("no-such.txt", "cannot read layout no-such.txt"),
+    ("ring.txt --level expert", "`dmcvb-gen train-behaviour --layout FILE`"),
+    (f"{MAZE}@geodesik", "geodesic"),
+    (f"{MAZE} --goal seen", "visible"),
+    (f"{MAZE} --goal fixed0x", "unknown goal"),
+    (f"{MAZE} --goal fixed100000", "fixed goals"),
+    (f"{MAZE} --steps 100", "episodes"),
+    (f"{MAZE} walker-walk", "mazes and locomotion tasks take different settings"),
+    (f"{MAZE} --distractor dynamic", "no effect in mazes, which vary in style; ask for --goal"),
+    (f"{MAZE} --backgrounds builtin", "no subset shows videos"),
+    (f"{MAZE} --independent", "always have their own episodes"),
+    ("walker-walk --goal hidden", "--goal is for mazes"),
+    ("walker-walk --backgrounds builtin", "--distractor static or dynamic"),
+    ("walker-walk --distractor dynamic_camera-light --split val", "shows videos"),
+    ("walker-walk --level random --sample", "level random is always drawn"),
+    ("--recipe dmcvb-mini walker-walk --distractor none --split val", "--distractor static or dynamic"),
+    ("--recipe dmcvb-mini walker-walk --level random --sample", "level random is always drawn"),
+]
+OTHERS = [
+    ("--fast", "`dmcvb-gen --help` lists the options"),
+    ("rolout", "Did you mean 'rollout'?"),
+    ("info", "see `dmcvb-gen info --help`"),
+    ("info empty", "holds no release"),
+    ("info r --option a=b", "r is a folder"),
+    ("info s3://", "s3:// names no bucket; give s3://BUCKET/NAME"),
+    ("diff a b c", "see `dmcvb-gen diff --help`"),
+    ("status r --option a=b", "r is a folder"),
+    ("rollout --out r --seed 5", "TASKs or --recipe"),
+    ("cluster part r 3/2", "K from 1 to N"),
+    ("cluster part r ²/³", "K from 1 to N"),
+    ("cluster part empty 1/2", "holds no release"),
+    ("cluster finish empty", "holds no release"),
+    ("cluster begin walker-walk --level master --out new", "expert"),
+    ("publish r s3://", "names no bucket"),
+    ("publish r mine --option a=b", "mine is a folder"),
+    ("fetch s3:// --out new", "names no bucket"),
+    ("fetch r --out mine --option a=b", "r is a folder"),
+    ("fetch file:x --out s3://bucket/demo", "s3://bucket/demo is a URL; give a local one, a folder or file"),
+    ("export r --to hdf5 --out mine --option a=b", "r is a folder"),
+    ("paint s3://bucket/demo", "dmcvb-gen fetch s3://bucket/demo --paint --out FOLDER"),
+    ("paint r --size 2000", "8 to 1024"),
+    ("paint r --views nowhere", "unknown view"),
+    ("paint r --only cheetah-run", "walker-walk/random/none"),
+    ("paint r --goal hidden", "ant-maze"),
+    ("regenerate", "give a RELEASE"),
+    ("regenerate r --manifest quickstart", "give a RELEASE"),
+    ("regenerate --manifest quickstart", "add --out"),
+    (
+        "regenerate --manifest quickstart --check",
+        "remove --check: with --manifest, digests are always compared",
+    ),
+    ("regenerate --manifest quickstart --check --out new", "remove --check"),
+    ("regenerate --manifest quickstrat --out new", "unknown manifest"),
+    ("regenerate --manifest no/m.json.xz --out new", "is no file"),
+    ("regenerate r --check --out new", "not both"),
+    ("regenerate r --out r", "remove --out"),
+    ("regenerate r --check --range 7:9", "no subset has episodes 7:9"),
+    ("verify s3://bucket/r --workers ray", "--workers has no effect"),
+    ("verify s3://bucket/r --backgrounds videos", "--backgrounds has no effect"),
+    ("verify r --all", "--all has no effect"),
+    ("verify r --option endpoint_url=http://127.0.0.1:1", "--option has no effect"),
+    ("card r --check --url file:/x", "--check writes no card"),
+    ("validate r --agents state-bc,bc --dino-weights x", "add --agents dino+bc"),
+    ("validate r --benchmark b9", "unknown benchmark 'b9'"),
+    ("validate r --benchmark b3", "has no data"),
+    ("validate r --agent nowhere:x", "cannot find agent nowhere:x"),
+    ("validate r --only foo*", "unknown subset pattern 'foo*'"),
+]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, small_release):
+    """A folder with a release and files that are wrong in a way."""
+    folder = tmp_path_factory.mktemp("place")
+    (folder / "r").symlink_to(small_release)
+    (folder / "empty").mkdir()
+    (folder / "broken").mkdir()
+    (folder / "broken/bad.mp4").write_bytes(b"nothing like a video" * 20)
+    (folder / "hole.txt").write_text("****\n*   \n****\n")
+    (folder / "ring.txt").write_text("*****\n*   *\n* * *\n*   *\n*****\n")
+    source = bundled_policies("walker-walk", "expert")[0]
+    shutil.copy(source, folder / "walker.safetensors")
+    (folder / "truncated.safetensors").write_bytes(source.read_bytes()[:5000])
+    policy = load_policy(source)
+    weights = {name: value.copy() for name, value in policy.weights.items()}
+    weights["mean.weight"][0, 0] = np.nan
+    save_policy(folder / "nan.safetensors", policy.header, weights)
+    return folder
+
+
+@pytest.mark.parametrize("words, cure", [(f"rollout {words} --out new", cure) for words, cure in ROLLOUTS] + OTHERS)
+def test_a_mistake_is_answered_in_a_line_with_the_cure_and_nothing_is_written(place, monkeypatch, words, cure):
+    monkeypatch.chdir(place)
+    before = sorted(place.iterdir())
+    said = invoke(*words.split(), code=2).output
+    assert cure in said and said.startswith("error: ") and said.count("\n") == 1, said
+    assert sorted(place.iterdir()) == before
+
+
+@pytest.mark.parametrize("pair", ["endpoint", "=x", "secret=x", "aws_session_token=x"])
+def test_options_of_a_store_are_pairs_and_no_secrets(pair):
+    with pytest.raises(Exception, match="NAME=VALUE|in the environment"):
+        parse_options(None, None, [pair])
+
+
+TWINS = [TINY_MAZE.replace("tiny", "twin"), "ant-maze-twin:*****/*...*/*****"]
+PYTHON = [
+    (lambda out: dmcvb_gen.rollout("walker-walk", episodes=0, out=out), "^episodes is 0: input should be"),
+    (lambda out: dmcvb_gen.rollout("walker-walk", size="large", out=out), "^size is 'large': input"),
+    (lambda out: dmcvb_gen.rollout("walker-walk", episodes=2, steps=9, out=out), "give episodes or steps, not both"),
+    (lambda out: dmcvb_gen.rollout("walker-walk", episode_range="0:1", out=out), "^episode_range is '0:1': input"),
+    (lambda out: dmcvb_gen.rollout("walker-walk", workers=-3, out=out), "^workers is -3: input should be greater"),
+    (lambda out: dmcvb_gen.rollout(None, out=out), "^tasks is None"),
+    (lambda out: dmcvb_gen.rollout("walker-walk", behaviour="", out=out), "behaviour is empty; leave it out"),
+    (lambda out: dmcvb_gen.rollout(TWINS, levels="random", out=out), "two mazes are called ant-maze-twin; rename"),
+    (lambda out: dmcvb_gen.paint(out, views=[]), "views names no view"),
+    (lambda out: dmcvb_gen.regenerate(manifest="quickstart"), "out=FOLDER"),
+    (lambda out: dmcvb_gen.verify(out, everything=True), "always read whole"),
+    (lambda out: dmcvb_gen.fetch("file:/nowhere", out, size=32), "paint=True"),
+    (lambda out: dmcvb_gen.fetch("file:publ", out, episode_range=(2, 2)), "with 0 <= A < B"),
+    (lambda out: dmcvb_gen.export(out, "hdf5", out / "x"), "no release"),
+    (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), ": checks_only trains nothing"),
+    (lambda out: dmcvb_gen.validate(out, scale=float("inf")), "^scale is inf: input should be "),
+    (lambda out: dmcvb_gen.repaint(out, out=None), "^out is None: input should be"),
+]
+
+
+@pytest.mark.parametrize("call, message", PYTHON)
+def test_functions_refuse_what_their_commands_do_and_name_parameters(call, message, tmp_path):
+    with pytest.raises(DmcvbError, match=message) as caught:
+        call(tmp_path / "out")
+    assert " --" not in re.sub("`[^`]*`|dmcvb-gen [^;,]*", "", f" {caught.value}"), "a flag, which Python has not"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("message, named", [
+    ("choose another --out, or fewer --episodes", "choose another out, or fewer episodes"),
+    ("select with --only and --range", "select with only and episode_range"),
+    ("see `info --json`; add --checks-only", "see `info --json`; add checks_only"),
+    ("run dmcvb-gen fetch URL --out FOLDER; or leave --paint", "run dmcvb-gen fetch URL --out FOLDER; or leave paint"),
+])  # fmt: skip
+def test_messages_of_functions_name_parameters(message, named):
+    assert with_parameters(message) == named
