@@ -68,8 +68,6 @@ DISTRACTOR_KINDS = ("none", "static", "dynamic")
 """DMC-VB's kinds of distractors; `distractor_kinds` has those of users besides."""
 DISTRACTOR_ENTRY_POINTS = "dmcvb_gen.distractors"
 """Entry points of other packages' distractors: the kind's name -> its class; see `distractors.registry`."""
-own_distractors: set[str] = set()
-"""Kinds that were registered in this process."""
 DIFFICULTY_SCALES = {"easy": 0.1, "medium": 0.2, "hard": 0.3}
 """Difficulty -> the scale s of every range (Distracting Control Suite); medium is DMC-VB's."""
 DIFFICULTY_VIDEOS = {"easy": 4, "medium": 8, "hard": None}
@@ -287,12 +285,12 @@ def _canonical(difficulty: str) -> str:
 
 
 def distractor_kinds() -> tuple[str, ...]:
-    """All kinds of distractors: DMC-VB's, then those that users registered or named, then those of packages."""
+    """All kinds of distractors: DMC-VB's, then those that users named, then those of packages."""
     from importlib import metadata  # slow to import, and `--help` needs no distractors
 
     installed = [point.name for point in metadata.entry_points(group=DISTRACTOR_ENTRY_POINTS)]
     named = [kind_of(name) for name in allowed(DISTRACTORS)]
-    return tuple(dict.fromkeys([*DISTRACTOR_KINDS, *sorted(own_distractors), *named, *installed]))
+    return tuple(dict.fromkeys([*DISTRACTOR_KINDS, *named, *installed]))
 
 
 def kind_of(name: str) -> str:

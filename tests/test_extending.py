@@ -42,9 +42,10 @@ def test_an_example_is_short_and_shown(path):
     assert f"examples/extending/{path.name}" in (ROOT / "docs" / "extending.md").read_text()
 
 
-def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path):
-    load("distractor")
-    run("rollout", "walker-walk", "--distractor", "grey_hard", *SHORT, "--out", tmp_path / "r")
+def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path, monkeypatch):
+    monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", "")
+    name = load("distractor").__name__
+    run("rollout", "walker-walk", "--distractor", f"{name}:Grey_hard", *SHORT, "--out", tmp_path / "r")
     run("verify", tmp_path / "r")
     subset = Release.open(tmp_path / "r")["walker-walk/random/grey_hard"]
     colors = subset.read("exogenous/material_rgb")
@@ -53,6 +54,10 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path):
     assert (subset.read("exogenous/background_video") == -1).all()  # what it does not give is the task's own
     run("card", tmp_path / "r")
     assert "Every material has the same grey" in (tmp_path / "r" / "README.md").read_text()
+    for gone, told in (("", "unknown distractor 'grey'"), ("gone_file:Grey", "cannot find distractor gone_file:Grey")):
+        monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", gone)
+        result = CliRunner().invoke(main, ["verify", str(tmp_path / "r")])
+        assert result.exit_code == 3 and "NOT CHECKED" in result.output and told in result.output, result.output
 
 
 @pytest.mark.slow_cases("small_mazes", "small_release")

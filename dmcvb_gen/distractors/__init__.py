@@ -12,7 +12,7 @@ import numpy as np
 from dmcvb_gen.distractor_state import LABEL_DTYPES, DistractorState
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
 from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene, floor_alpha_for
-from dmcvb_gen.distractors.registry import BUILT_IN, distractors_of, register_distractor
+from dmcvb_gen.distractors.registry import BUILT_IN, distractors_of
 from dmcvb_gen.tasks.base import Task
 
 
@@ -99,6 +99,5 @@ __all__ = [
     "Scene",
     "floor_alpha_for",
     "load_backgrounds",
-    "register_distractor",
     "sample_distractors",
 ]

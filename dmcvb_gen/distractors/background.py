@@ -35,14 +35,12 @@ class Background(Distractor):
         lengths, ticks = scene.backgrounds.lengths, scene.task.action_repeat * np.arange(scene.frames)
         in_play = len(lengths) if scene.setting.videos is None else min(scene.setting.videos, len(lengths))
         moves = ticks // TICKS_A_FRAME if scene.setting.kind == "dynamic" else np.zeros_like(ticks)
-        self._video, self._index = np.empty((2, len(generators), scene.frames), np.int16)
+        video, index = np.empty((2, len(generators), scene.frames), np.int16)
         for episode, rng in enumerate(generators):
-            self._video[episode] = chosen = int(rng.integers(in_play))
+            video[episode] = chosen = int(rng.integers(in_play))
             start, direction = int(rng.integers(lengths[chosen])), int(rng.integers(2)) * 2 - 1
-            self._index[episode] = ping_pong(start, direction, moves, int(lengths[chosen]))
-
-    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        return {"background_video": self._video[:, frames], "background_frame": self._index[:, frames]}
+            index[episode] = ping_pong(start, direction, moves, int(lengths[chosen]))
+        self.drawn = {"background_video": video, "background_frame": index}
 
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:

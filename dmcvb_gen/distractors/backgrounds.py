@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import re
 import subprocess
 from collections import OrderedDict
@@ -17,7 +18,7 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from dmcvb_gen.errors import BackgroundError
 
@@ -102,13 +103,9 @@ def load_backgrounds(source: str | Path = "builtin", split: str = "train", video
     Raises:
       BackgroundError: no such folder, nothing in it, or a video that cannot be read or is cut short (named).
     """
-    if split not in _SPLITS:
-        raise BackgroundError(f"unknown split {split!r} of backgrounds; known: train, val")
     root = builtin_folder() if source == "builtin" else Path(source)
-    if root.is_file():
-        raise BackgroundError(f"background source {str(source)!r} is a file; give the folder that holds it")
     if not root.is_dir():
-        raise BackgroundError(f"background folder {str(source)!r} does not exist; give a folder of videos or 'builtin'")
+        raise BackgroundError(f"backgrounds {str(source)!r} are no folder; give a folder of videos, or 'builtin'")
     try:
         found = _find_split(root, split)[:videos]
         stamps = tuple((p.stat().st_mtime_ns, p.stat().st_size) for _, files in found for p in files)
@@ -212,21 +209,15 @@ def _read_pictures(path: Path) -> np.ndarray:
     with Image.open(path) as picture:
         if picture.width * picture.height > MAX_PIXELS:
             raise ValueError(f"{picture.width} x {picture.height} is more than {MAX_PIXELS:,} pixels")
-        frames = []
-        for index in range(MAX_FRAMES):  # to count the frames of a hostile file takes for ever
-            try:
-                picture.seek(index)
-            except EOFError:
-                break
-            frames.append(square(_eight_bits(picture).convert("RGB")))
-    return np.stack(frames)
+        frames = itertools.islice(ImageSequence.Iterator(picture), MAX_FRAMES)  # a hostile file has no end
+        return np.stack([square(_eight_bits(frame).convert("RGB")) for frame in frames])
 
 
 def _eight_bits(picture: Image.Image) -> Image.Image:
     """Scale images of 16 bits, which `convert` would cut at 255."""
-    return (
-        picture.convert("I").point(lambda value: value / 257).convert("L") if picture.mode.startswith("I") else picture
-    )
+    if not picture.mode.startswith("I"):
+        return picture
+    return picture.convert("I").point(lambda value: value / 257).convert("L")
 
 
 def _read_video(path: Path) -> np.ndarray:

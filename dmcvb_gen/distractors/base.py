@@ -44,19 +44,20 @@ class Distractor(abc.ABC):
       kinds: kinds of settings under which it varies.
       stream: the episode's random stream that it draws from, one of `seeding.STREAMS`.
       names: labels that it gives, fields of `DistractorState`; these are stored, and renderers paint from them.
+      drawn: those of them that do not follow the agent, each (episode, frame, ...).
     """
 
     kinds: ClassVar[tuple[str, ...]]
     stream: ClassVar[str]
     names: ClassVar[tuple[str, ...]]
+    drawn: Mapping[str, np.ndarray] = {}
 
     @abc.abstractmethod
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
         """Draw whole episodes, one from each generator. A longer episode must begin with the shorter one."""
 
-    @abc.abstractmethod
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        """The labels of some frames.
+        """The labels of some frames, by default what was drawn for them.
 
         Args:
           physics: (episode, physics) or (episode, frame, physics) float64, the states at these frames.
@@ -65,6 +66,7 @@ class Distractor(abc.ABC):
         Returns:
           name -> array with the leading shape of `physics`.
         """
+        return {name: values[:, frames] for name, values in self.drawn.items()}
 
     def adjust(self, found: dict[str, np.ndarray], actions: np.ndarray, frames: int | slice) -> None:  # noqa: B027
         """Change labels that other distractors gave, in place; does nothing by default.
@@ -81,7 +83,7 @@ class Distractor(abc.ABC):
 
         Only distractors whose labels every subset stores (`BUILT_IN`) need it; the others are never left out.
         """
-        raise NotImplementedError
+        return {}
 
 
 def bounded_walk(

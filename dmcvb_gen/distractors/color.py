@@ -37,14 +37,12 @@ class Color(Distractor):
         start = np.stack([rng.random(own.shape) for rng in generators])
         color = low + start * (high - low)  # uniform in what is left of the range inside [0, 1]
         if scene.setting.kind == "dynamic":
-            self._colors = bounded_walk(scene, generators, color, low, high, STEP_STD * scale)
+            colors = bounded_walk(scene, generators, color, low, high, STEP_STD * scale)
         else:
-            self._colors = np.repeat(color[:, None], scene.frames, axis=1)
+            colors = np.repeat(color[:, None], scene.frames, axis=1)
         unseen = np.setdiff1d(np.arange(len(own)), seen_materials(scene.task.model))
-        self._colors[:, :, unseen] = own[unseen]  # a label without effect would only cost bytes
-
-    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        return {"material_rgb": self._colors[:, frames]}
+        colors[:, :, unseen] = own[unseen]  # a label without effect would only cost bytes
+        self.drawn = {"material_rgb": colors}
 
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:

@@ -6,7 +6,7 @@ the opposite, at random so that the two correlate by RHO. Environments show the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,9 +29,6 @@ class Cue(Distractor):
         drawn = np.stack([rng.random(scene.frames) for rng in generators])
         self._follows = drawn < (1 + scene.setting.scale_of("cue")) / 2
         self._coin = drawn < 0.5
-
-    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        return {}
 
     def adjust(self, found: dict[str, np.ndarray], actions: np.ndarray, frames: int | slice) -> None:
         sign = np.sign(actions[..., 0])

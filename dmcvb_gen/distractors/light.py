@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,11 +29,4 @@ class Light(Distractor):
             raise DmcvbError(f"{scene.task.id} has no lamp, so its light cannot vary; remove light")
         most = RANGE * scene.setting.scale_of("light") * float(heights.max())
         place = (2 * np.stack([rng.random(3) for rng in generators]) - 1) * most
-        self._shift = bounded_walk(scene, generators, place, -most, most, STEP_STD * most)
-
-    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        return {"light_shift": self._shift[:, frames]}
-
-    @classmethod
-    def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
-        return {}  # the label is stored only if it varies
+        self.drawn = {"light_shift": bounded_walk(scene, generators, place, -most, most, STEP_STD * most)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -26,9 +26,6 @@ class Shake(Distractor):
         distance = arithmetic.norm(np.asarray(model.cam_poscom0[camera_ids(scene.task)[0]]))
         drawn = np.stack([arithmetic.normal(rng, (scene.frames, 3)) for rng in generators])
         self._shift = SHARE * scene.setting.scale_of("shake") * float(distance) * drawn
-
-    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        return {}
 
     def adjust(self, found: dict[str, np.ndarray], actions: np.ndarray, frames: int | slice) -> None:
         found["camera_position"] = found["camera_position"] + self._shift[:, frames][..., None, :]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -22,9 +22,7 @@ class Style(Distractor):
 
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
         task, styles = scene.task, scene.task.styles(scene.split)
-        self._style = np.full((scene.episodes, scene.frames), -1, np.int16)
+        style = np.full((scene.episodes, scene.frames), -1, np.int16)
         if styles:
-            self._style[:] = [[_draw(rng, task.looks(_draw(rng, styles)))] for rng in generators]
-
-    def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        return {"style": self._style[:, frames]}
+            style[:] = [[_draw(rng, task.looks(_draw(rng, styles)))] for rng in generators]
+        self.drawn = {"style": style}

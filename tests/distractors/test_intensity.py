@@ -134,12 +134,8 @@ def test_a_release_of_them_goes_the_whole_way(task_id, tmp_path):
     assert "same digest" in run("regenerate", folder, "--check")
     [lit] = [subset for subset in subsets.values() if "light" in subset.setting]
     assert lit.read("exogenous/light_shift").shape == (2, 7, 3) and lit.labels().light_shift.any()
-    few = ["--profile", "smoke", "--agents", "state-bc,bc", "--workers", 1, "--out", tmp_path / "report"]
-    run("validate", folder, *few)
-    assert json.loads((tmp_path / "report" / "report.json").read_text())["structure"]["sound"]
     run("card", folder)
     assert all(sentence in (folder / "README.md").read_text() for sentence in SENTENCES.values())
-    run("export", folder, "--to", "npz", "--out", tmp_path / "npz")
     plain = ["repaint", folder, "--only", f"{task_id}/random/static_0.35", "--out", tmp_path / "again", "--distractor"]
     run(*plain, "dynamic_color0.9")
     [again] = Release.open(tmp_path / "again").subsets.values()
@@ -159,11 +155,14 @@ def test_a_release_of_them_goes_the_whole_way(task_id, tmp_path):
         (["walker-walk", "--distractor", "static_cue0.5"], "has no cue, shake or light"),
         (["ant-maze-empty7x7", "--distractor", "dynamic_background2"], "--distractor has no effect in mazes"),
         (["walker-walk", "--distractor", "dynamic_2"], "is not above 0 and up to 1"),
+        (["walker-walk", "--distractor", "math:Nothing"], "cannot find distractor math:Nothing"),
+        (["walker-walk", "--distractor", "math:pi_hard"], "is no distractor 'pi'"),
     ],
 )
-def test_what_has_no_effect_or_sense_is_one_line(options, message, tmp_path):
+def test_what_has_no_effect_or_sense_is_one_line(options, message, tmp_path, monkeypatch):
+    monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", "")
     done = CliRunner().invoke(main, ["rollout", *options, "--out", str(tmp_path / "r")])
-    assert done.exit_code == 2 and message in done.output and "Traceback" not in done.output
+    assert done.exit_code == 2 and message in done.output and done.output.count("\n") == 1, done.output
     assert not (tmp_path / "r").exists()
 
 
@@ -185,25 +184,16 @@ def cue_and_action(subset):
 @pytest.mark.parametrize("task_id", ["walker-walk", "cartpole-swingup"])
 @pytest.mark.parametrize("rho", [0.3, 0.9])
 def test_the_cue_in_the_data_correlates_with_the_action_as_asked(task_id, rho, tmp_path):
-    folder = tmp_path / "r"
-    words = ["--level", "random", "--episodes", 20, "--max-steps", 100, "--no-pixels", "--out", folder]
-    run("rollout", task_id, *words, "--distractor", f"dynamic_cue{rho}")
+    folder = tmp_path / "again"
+    words = ["--level", "random", "--episodes", 20, "--max-steps", 100, "--no-pixels", "--out", tmp_path / "r"]
+    run("rollout", task_id, *words, "--distractor", "none")
+    run("repaint", tmp_path / "r", "--distractor", f"dynamic_cue{rho}", "--out", folder)
     [subset] = Release.open(folder).subsets.values()
     cue, action = cue_and_action(subset)
     assert len(cue) == 2000 and set(np.unique(cue)) == {-1.0, 1.0}
     assert abs(np.corrcoef(cue, action)[0, 1] - rho) < 4 / np.sqrt(2000)
     assert json.loads(run("verify", folder, "--json"))["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
-
-
-@pytest.mark.slow
-def test_stored_actions_decide_the_cues_of_repainted_images(tmp_path):
-    short = ["--level", "random", "--episodes", 2, "--max-steps", 6, "--no-pixels", "--out", tmp_path / "r"]
-    run("rollout", "walker-walk", "--distractor", "none", *short)
-    run("repaint", tmp_path / "r", "--distractor", "dynamic_cue1", "--out", tmp_path / "again")
-    [again] = Release.open(tmp_path / "again").subsets.values()
-    cue, action = cue_and_action(again)
-    np.testing.assert_array_equal(cue, action)
 
 
 def test_environments_show_the_cue_of_the_actions_that_are_taken_there():

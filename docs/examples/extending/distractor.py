@@ -1,11 +1,10 @@
-"""A distractor: `--distractor grey` gives every material one grey, drawn for each episode."""
+"""A distractor: `--distractor my_file:Grey` gives every material one grey, drawn for each episode."""
 
 import numpy as np
 
-from dmcvb_gen.distractors import Distractor, register_distractor
+from dmcvb_gen.distractors import Distractor
 
 
-@register_distractor
 class Grey(Distractor):
     """Every material has the same grey, uniform within s of the middle."""
 
@@ -16,7 +15,5 @@ class Grey(Distractor):
     def __init__(self, scene, generators):
         shape = (scene.frames, *scene.task.material_colors.shape)
         scale = scene.setting.scale
-        self._grey = np.stack([np.full(shape, 0.5 + scale * rng.uniform(-1, 1)) for rng in generators])
-
-    def labels(self, physics, frames):
-        return {"material_rgb": self._grey[:, frames]}
+        greys = np.stack([np.full(shape, 0.5 + scale * rng.uniform(-1, 1)) for rng in generators])
+        self.drawn = {"material_rgb": greys}
