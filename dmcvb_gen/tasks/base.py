@@ -357,6 +357,7 @@ class PhysicsBatch(EpisodeBatch):
         self.sims = Batch(task.model, size, nthread=threads, persistent=True)
         self._ctrl = self.sims.bind("ctrl")
         self._steps = np.zeros(size, int)
+        self._physics_columns = physics_columns(task.model)
 
     # -- what a task must say ---------------------------------------------------------------
 
@@ -429,13 +430,6 @@ class PhysicsBatch(EpisodeBatch):
         self._refresh(ids)
         return self.state()
 
-    @property
-    def _physics_columns(self) -> np.ndarray:
-        """Return the columns of `PHYSICS_SPEC`'s components in a batch's state rows (`mjSTATE_INTEGRATION`)."""
-        if not hasattr(self, "_columns"):
-            self._columns = physics_columns(self.task.model)
-        return self._columns
-
 
 def diverged(warnings: Sequence[str]) -> str:
     """The reason of an `EpisodeError` for MuJoCo's warnings."""
@@ -444,31 +438,19 @@ def diverged(warnings: Sequence[str]) -> str:
 
 def physics_columns(model: mujoco.MjModel, spec: int = PHYSICS_SPEC) -> np.ndarray:
     """Indices of the components of `spec` inside a state vector of `mjSTATE_INTEGRATION`."""
-    columns: list[int] = []
-    offset = 0
-    for bit in range(32):
-        component = 1 << bit
-        if not component & int(mujoco.mjtState.mjSTATE_INTEGRATION):
-            continue
-        size = mujoco.mj_stateSize(model, component)
-        if component & spec:
-            columns.extend(range(offset, offset + size))
-        offset += size
-    return np.array(columns, int)
+    whole = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    columns = np.empty(mujoco.mj_stateSize(model, spec))
+    mujoco.mj_extractState(model, np.arange(mujoco.mj_stateSize(model, whole), dtype=float), whole, columns, spec)
+    return columns.astype(int)
 
 
-_SIGMOID_DEFAULT = 0.1
-
-
-def tolerance(x, lower=0.0, upper=0.0, margin=0.0, sigmoid="gaussian", value_at_margin=_SIGMOID_DEFAULT):
+def tolerance(x, lower=0.0, upper=0.0, margin=1.0, sigmoid="gaussian", value_at_margin=0.1):
     """1 where x lies in [lower, upper], falling to `value_at_margin` at `margin` outside (elementwise).
 
     The reward shape of the DeepMind Control Suite, for arrays: sigmoid "gaussian", "linear" or "quadratic".
     """
     x = np.asarray(x, np.float64)
     inside = (lower <= x) & (x <= upper)
-    if margin == 0:
-        return np.where(inside, 1.0, 0.0)
     distance = np.where(x < lower, lower - x, x - upper) / margin
     if sigmoid == "gaussian":
         scale = math.sqrt(-2 * math.log(value_at_margin))

@@ -27,12 +27,12 @@ class _KeptBatch:
         self._task, self._columns = task, physics_columns(task.model, task.physics_spec)
         self._lock = threading.Lock()  # the simulations are one caller's until it has copied its poses
         self._size = 0
-        self._batch: Any = None
-        self._bound: dict[str, Any] = {}
 
     def __call__(self, physics: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
         with self._lock:
-            self._make(min(len(physics), CHUNK), fields)
+            if (size := min(max(len(physics), 1), CHUNK)) > self._size:
+                self._make(size)
+            self._bound |= {name: self._batch.bind(name) for name in fields if name not in self._bound}
             out = {name: np.empty((len(physics), *self._bound[name].shape[1:])) for name in fields}
             for first in range(0, len(physics), self._size):
                 count = min(self._size, len(physics) - first)
@@ -47,18 +47,12 @@ class _KeptBatch:
                     out[name][first : first + count] = self._bound[name][:count]
         return out
 
-    def _make(self, size: int, fields: Sequence[str]) -> None:
-        if size > self._size or self._batch is None:
-            self._size = 1 << max(size - 1, 0).bit_length()
-            self._batch, self._bound = (
-                Batch(_awake(self._task.model), self._size, nthread=1),
-                dict.fromkeys(self._bound),
-            )
-            moving = (name for name in self._task.model_entries if name in MODEL_FIELDS)  # others move nothing
-            self._entries = {name: self._batch.expand(name) for name in moving}
-        for name in {*self._bound, *fields}:
-            if self._bound.get(name) is None:
-                self._bound[name] = self._batch.bind(name)
+    def _make(self, size: int) -> None:
+        self._size = 1 << (size - 1).bit_length()
+        self._batch = Batch(_awake(self._task.model), self._size, nthread=1)
+        self._bound: dict[str, Any] = {}
+        moving = (name for name in self._task.model_entries if name in MODEL_FIELDS)  # others move nothing
+        self._entries = {name: self._batch.expand(name) for name in moving}
 
 
 def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -104,9 +98,8 @@ def seen_materials(model: mujoco.MjModel) -> np.ndarray:
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) as quaternions (..., 4), w x y z with w >= 0."""
-    from scipy.spatial.transform import (
-        Rotation,  # scipy takes a fifth of a second, which commands that list or show need not wait for
-    )
+    # Scipy takes a fifth of a second, which commands that list or show need not wait for.
+    from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_matrix(matrices.reshape(-1, 3, 3))
     return rotation.as_quat(canonical=True, scalar_first=True).reshape(*matrices.shape[:-2], 4)

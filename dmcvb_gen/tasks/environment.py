@@ -70,7 +70,6 @@ class EnvironmentTask(Task):
         self._fixed: dict[str, np.ndarray] = {}
         with self._starting():
             environment = self.make_environment(PROBE_SEEDS[0])
-            _check_environment(id, environment)
             self.action_low, self.action_high = _bounds(id, environment)
             self._control_steps = environment._step_limit
             self.substeps, self.control_timestep = environment._n_sub_steps, environment.control_timestep()
@@ -299,14 +298,11 @@ class _Probe:
         rows = zip(self._rows, other._rows, strict=False)
         if len(self._rows) != len(other._rows) or not all(same(one, two) for one, two in rows):
             return "episode"
-        names = (
-            name
-            for one, two in zip(self.models, other.models, strict=True)
-            for name in one
-            if not same(one[name], two[name])
-        )
-        name = next(names, None)
-        return name and f"{name} of the model"
+        for one, two in zip(self.models, other.models, strict=True):
+            for name in one:
+                if not same(one[name], two[name]):
+                    return f"{name} of the model"
+        return None
 
 
 def same(one: np.ndarray, two: np.ndarray) -> bool:
@@ -314,26 +310,20 @@ def same(one: np.ndarray, two: np.ndarray) -> bool:
     return one.shape == two.shape and bool(((one == two) | (one != one) & (two != two)).all())
 
 
-def _check_environment(id: str, environment: Any) -> None:
-    from dm_control import mujoco as dm_mujoco
+def _bounds(id: str, environment: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest actions, (action,) float32; [-1, 1] where there are none."""
     from dm_control.rl import control
 
     if not isinstance(environment, control.Environment):
-        raise DmcvbError(
-            f"{id} gives a {type(environment).__name__}; give a function that returns a "
-            "dm_control.rl.control.Environment"
-        )
-    if not isinstance(environment.physics, dm_mujoco.Physics):
-        raise DmcvbError(f"{id} has a {type(environment.physics).__name__}; give it a dm_control.mujoco.Physics")
-
-
-def _bounds(id: str, environment: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the largest actions, (action,) float32; [-1, 1] where there are none."""
+        given = type(environment).__name__
+        raise DmcvbError(f"{id} gives a {given}; give a function that returns a dm_control.rl.control.Environment")
     spec = environment.action_spec()
-    shape, dtype = getattr(spec, "shape", None), getattr(spec, "dtype", None)
-    if shape is None or len(shape) != 1 or not shape[0] or np.dtype(dtype).kind != "f":
-        given = f"{dtype} of shape {shape}" if shape is not None else f"a {type(spec).__name__}"
-        raise DmcvbError(f"{id} takes {given} as actions; give it actuators, and one row of numbers that drives them")
+    shape, dtype = spec.shape, np.dtype(spec.dtype)
+    if len(shape) != 1 or not shape[0] or dtype.kind != "f":
+        raise DmcvbError(
+            f"{id} takes {dtype} of shape {shape} as actions; give it actuators, and one row of numbers that drives "
+            "them"
+        )
     low, high = (
         np.broadcast_to(np.asarray(getattr(spec, name, default), float), shape)
         for name, default in (("minimum", -np.inf), ("maximum", np.inf))
@@ -534,9 +524,8 @@ class EnvironmentBatch(EpisodeBatch):
         reward, discount = np.zeros(self.size), np.ones(self.size)
         moving = self._all if active is None else np.flatnonzero(active)
         episodes = [episode for sim in moving.tolist() if not (episode := self._running(sim)).over]
-        watch = contextlib.nullcontext() if self.task.trusted else watched(self.task.error)
-        terminated, truncated = np.zeros(self.size, bool), np.zeros(self.size, bool)
-        with watch:
+        terminated, truncated = np.zeros((2, self.size), bool)
+        with contextlib.nullcontext() if self.task.trusted else watched(self.task.error):
             for episode in episodes:
                 sim = episode.place
                 reward[sim], discount[sim] = episode.step(actions[sim])

@@ -7,28 +7,22 @@ batch. dm_control is the authority: from the same physics state and actions they
 from __future__ import annotations
 
 import functools
-import importlib.util
 from collections.abc import Sequence
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.tasks.base import PhysicsBatch, Task, tolerance
+from dmcvb_gen.tasks.suite import suite_folder
 
 EPISODE_STEPS = 500
 """Agent steps an episode: 1000 control steps at action repeat 2 (paper, section 3.1)."""
 
 
 def _suite_model(domain: str) -> mujoco.MjModel:
-    """The compiled model of a dm_control suite domain.
-
-    The XML files are read in place: importing `dm_control.suite` would load every domain and a GL library.
-    """
-    found = importlib.util.find_spec("dm_control")
-    assert found and found.submodule_search_locations  # a dependency of ours, and a package
-    suite = Path(found.submodule_search_locations[0]) / "suite"
+    """The compiled model of a domain of dm_control's suite, whose XML files are read in place."""
+    suite = suite_folder()
     assets = {f"./common/{path.name}": path.read_bytes() for path in (suite / "common").glob("*.xml")}
     mujoco.set_mju_user_warning(lambda message: None)  # an attribute of the cheetah's file is deprecated
     try:
@@ -41,7 +35,7 @@ class LocomotionTask(Task):
     """A suite task of 1000 control steps that only the clock ends."""
 
     domain: str
-    batch_class: type[PhysicsBatch]
+    batch_class: type[LocomotionBatch]
     max_steps = evaluation_steps = EPISODE_STEPS
 
     @functools.cached_property
@@ -52,22 +46,42 @@ class LocomotionTask(Task):
         return self.batch_class(self, size, threads)
 
 
-def _randomize_joints(batch: PhysicsBatch, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-    """Limited joints uniform in their range, free hinges in [-pi, pi], free bodies turned at random.
+class LocomotionBatch(PhysicsBatch):
+    """What the three batches measure."""
 
-    The free joint's quaternion is drawn from the unit cube and normalized, as dm_control does.
-    """
-    model, qpos = batch.task.model, batch.sims.bind("qpos")
-    for sim, rng in zip(ids, generators, strict=True):
-        for joint in range(model.njnt):
-            address, kind = model.jnt_qposadr[joint], model.jnt_type[joint]
-            if model.jnt_limited[joint]:
-                qpos[sim, address] = rng.uniform(*model.jnt_range[joint])
-            elif kind == mujoco.mjtJoint.mjJNT_HINGE:
-                qpos[sim, address] = rng.uniform(-np.pi, np.pi)
-            elif kind == mujoco.mjtJoint.mjJNT_FREE:
-                quaternion = rng.random(4)
-                qpos[sim, address + 3 : address + 7] = quaternion / arithmetic.norm(quaternion)
+    def __init__(self, task: Task, size: int, threads: int = 1):
+        super().__init__(task, size, threads)
+        bind = self.sims.bind
+        self._qpos, self._qvel = bind("qpos"), bind("qvel")
+        self._xmat, self._xpos = bind("xmat"), bind("xpos")
+        self._sensors = bind("sensordata")
+        self._torso = task.model.body("torso").id
+        self._velocity = int(task.model.sensor("torso_subtreelinvel").adr[0])
+
+    def torso_upright(self):
+        """Projection of the torso's z axis on the world's."""
+        return self._xmat[:, self._torso, 8]
+
+    def com_velocity(self):
+        """Velocity of the centre of mass, m/s, (size, 3)."""
+        return self._sensors[:, self._velocity : self._velocity + 3]
+
+    def _randomize_joints(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        """Limited joints uniform in their range, free hinges in [-pi, pi], free bodies turned at random.
+
+        The free joint's quaternion is drawn from the unit cube and normalized, as dm_control does.
+        """
+        model, qpos = self.task.model, self._qpos
+        for sim, rng in zip(ids, generators, strict=True):
+            for joint in range(model.njnt):
+                address, kind = model.jnt_qposadr[joint], model.jnt_type[joint]
+                if model.jnt_limited[joint]:
+                    qpos[sim, address] = rng.uniform(*model.jnt_range[joint])
+                elif kind == mujoco.mjtJoint.mjJNT_HINGE:
+                    qpos[sim, address] = rng.uniform(-np.pi, np.pi)
+                elif kind == mujoco.mjtJoint.mjJNT_FREE:
+                    quaternion = rng.random(4)
+                    qpos[sim, address + 3 : address + 7] = quaternion / arithmetic.norm(quaternion)
 
 
 # -- walker-walk --------------------------------------------------------------------------------
@@ -76,28 +90,13 @@ WALKER_STAND_HEIGHT = 1.2  # torso height (m) above which standing is fully rewa
 WALKER_SPEED = 1.0  # horizontal speed (m/s) above which walking is fully rewarded
 
 
-class WalkerBatch(PhysicsBatch):
-    def __init__(self, task, size, threads=1):
-        super().__init__(task, size, threads)
-        self._xmat, self._xpos = self.sims.bind("xmat"), self.sims.bind("xpos")
-        self._qvel, self._sensors = self.sims.bind("qvel"), self.sims.bind("sensordata")
-        self._torso = task.model.body("torso").id
-        self._velocity = int(task.model.sensor("torso_subtreelinvel").adr[0])
-
+class WalkerBatch(LocomotionBatch):
     def _initialize(self, ids, generators):
-        _randomize_joints(self, ids, generators)
+        self._randomize_joints(ids, generators)
         self._refresh(ids)
 
     def torso_height(self):
         return self._xpos[:, self._torso, 2]
-
-    def torso_upright(self):
-        """Projection of the torso's z axis on the world's."""
-        return self._xmat[:, self._torso, 8]
-
-    def horizontal_velocity(self):
-        """Horizontal velocity of the centre of mass, m/s."""
-        return self._sensors[:, self._velocity]
 
     def state(self):
         orientations = self._xmat[:, 1:][:, :, [0, 2]].reshape(self.size, -1)  # xx and xz of every body
@@ -108,7 +107,7 @@ class WalkerBatch(PhysicsBatch):
         upright = (1 + self.torso_upright()) / 2
         stand = (3 * standing + upright) / 4
         move = tolerance(
-            self.horizontal_velocity(),
+            self.com_velocity()[:, 0],
             WALKER_SPEED,
             np.inf,
             margin=WALKER_SPEED / 2,
@@ -134,13 +133,7 @@ CHEETAH_SPEED = 10.0  # m/s, fully rewarded
 CHEETAH_SETTLING_STEPS = 200  # physics steps that let the cheetah fall before the episode starts
 
 
-class CheetahBatch(PhysicsBatch):
-    def __init__(self, task, size, threads=1):
-        super().__init__(task, size, threads)
-        self._qpos, self._qvel = self.sims.bind("qpos"), self.sims.bind("qvel")
-        self._sensors, self._time = self.sims.bind("sensordata"), self.sims.bind("time")
-        self._velocity = int(task.model.sensor("torso_subtreelinvel").adr[0])
-
+class CheetahBatch(LocomotionBatch):
     def _initialize(self, ids, generators):
         model = self.task.model
         limited = model.jnt_qposadr[model.jnt_limited == 1]
@@ -149,18 +142,15 @@ class CheetahBatch(PhysicsBatch):
             self._qpos[sim, limited] = rng.uniform(low, high)
         self._ctrl[ids] = 0
         self.sims.step(ids=ids, nstep=CHEETAH_SETTLING_STEPS)
-        self._time[ids] = 0
+        self.sims.bind("time")[ids] = 0
         self._refresh(ids)
-
-    def speed(self):
-        """Horizontal speed of the centre of mass, m/s."""
-        return self._sensors[:, self._velocity]
 
     def state(self):
         return np.concatenate([self._qpos[:, 1:], self._qvel], axis=1)  # the horizontal position is left out
 
     def _control_reward(self):
-        return tolerance(self.speed(), CHEETAH_SPEED, np.inf, margin=CHEETAH_SPEED, value_at_margin=0, sigmoid="linear")
+        speed = self.com_velocity()[:, 0]
+        return tolerance(speed, CHEETAH_SPEED, np.inf, margin=CHEETAH_SPEED, value_at_margin=0, sigmoid="linear")
 
 
 class CheetahRun(LocomotionTask):
@@ -179,34 +169,23 @@ HUMANOID_STAND_HEIGHT = 1.4  # head height (m) above which standing is fully rew
 HUMANOID_SPEED = 1.0  # m/s, fully rewarded
 
 
-class HumanoidBatch(PhysicsBatch):
+class HumanoidBatch(LocomotionBatch):
     def __init__(self, task, size, threads=1):
         super().__init__(task, size, threads)
-        bind, model = self.sims.bind, task.model
-        self._qpos, self._qvel = bind("qpos"), bind("qvel")
-        self._xmat, self._xpos = bind("xmat"), bind("xpos")
-        self._sensors, self._ncon = bind("sensordata"), bind("ncon")
-        self._torso, self._head = model.body("torso").id, model.body("head").id
-        self._limbs = [model.body(side + limb).id for side in ("left_", "right_") for limb in ("hand", "foot")]
-        self._velocity = int(model.sensor("torso_subtreelinvel").adr[0])
+        body = task.model.body
+        self._ncon, self._head = self.sims.bind("ncon"), body("head").id
+        self._limbs = [body(side + limb).id for side in ("left_", "right_") for limb in ("hand", "foot")]
 
     def _initialize(self, ids, generators):
         # Redraw the poses that touch anything, each from its own generator, until none does.
         pending, rngs = np.asarray(ids), dict(zip(ids, generators, strict=True))
         while len(pending):
-            _randomize_joints(self, pending, [rngs[i] for i in pending])
+            self._randomize_joints(pending, [rngs[i] for i in pending])
             self._refresh(pending)
             pending = pending[self._ncon[pending] > 0]
 
     def head_height(self):
         return self._xpos[:, self._head, 2]
-
-    def torso_upright(self):
-        return self._xmat[:, self._torso, 8]
-
-    def com_velocity(self):
-        """Velocity of the centre of mass, m/s, (size, 3)."""
-        return self._sensors[:, self._velocity : self._velocity + 3]
 
     def extremities(self):
         """Hands and feet in the torso's frame, left hand, left foot, right hand, right foot, (size, 12)."""

@@ -14,13 +14,18 @@ from typing import Any
 from dmcvb_gen.tasks.environment import EnvironmentTask
 
 
-@functools.cache
-def suite_ids() -> tuple[str, ...]:
-    """Usable task ids "<domain>-<task>" of dm_control's suite, read from its source: importing it takes a second."""
+def suite_folder() -> Path:
+    """The folder of dm_control's suite; to import it would load every domain and a GL library, which takes a second."""
     found = importlib.util.find_spec("dm_control")
     assert found and found.submodule_search_locations  # a dependency of ours, and a package
+    return Path(found.submodule_search_locations[0]) / "suite"
+
+
+@functools.cache
+def suite_ids() -> tuple[str, ...]:
+    """Usable task ids "<domain>-<task>" of dm_control's suite, read from its source."""
     names = []
-    for path in sorted((Path(found.submodule_search_locations[0]) / "suite").glob("*.py")):
+    for path in sorted(suite_folder().glob("*.py")):
         added = re.findall(r"^@SUITE\.add\([^)]*\)\ndef (\w+)\(", path.read_text(), re.MULTILINE)
         names += [f"{path.stem}-{task}" for task in added]
     return tuple(names)

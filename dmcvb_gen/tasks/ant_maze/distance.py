@@ -36,8 +36,13 @@ class DistanceField(NamedTuple):
 
 
 @functools.cache
-def _floor(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Floor pixels (bool), the saturated speed there, and for every pixel the index of the nearest floor pixel."""
+def floor_of(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The floor of a layout, by pixels.
+
+    Returns:
+      (row, column) bool, the floor; (row, column) float64, the saturated speed there; (2, row, column) int, row and
+      column of the floor pixel nearest to each.
+    """
     floor = np.kron(~layout.walls, np.ones((PIXELS, PIXELS), bool))
     from_walls = np.asarray(skfmm.travel_time(floor.astype(float), np.ones(floor.shape), dx=1.0))
     from scipy import ndimage  # scipy takes a fifth of a second, which commands that list or show need not wait for
@@ -46,14 +51,8 @@ def _floor(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return floor, np.minimum(from_walls, SATURATION) / SATURATION, nearest
 
 
-def floor_pixels(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """(row, column) bool, the floor; (2, row, column) int, row and column of the floor pixel nearest to each."""
-    floor, _, nearest = _floor(layout)
-    return floor, nearest
-
-
 def _finish(times: np.ndarray, layout: Layout) -> DistanceField:
-    floor, _, nearest = _floor(layout)
+    floor, _, nearest = floor_of(layout)
     filled = np.ma.filled(times, np.nan)
     return DistanceField(filled[tuple(nearest)], float(np.nanmax(filled[floor])))
 
@@ -66,7 +65,7 @@ def saturated_field(layout: Layout, goal_cell: tuple[int, int]) -> DistanceField
       LayoutError: the goal is in a wall.
     """
     layout.check_cell(goal_cell, "goal")
-    floor, speed, _ = _floor(layout)
+    floor, speed, _ = floor_of(layout)
     row, column = (index * PIXELS for index in goal_cell)
     inside = np.zeros_like(floor)
     inside[row : row + PIXELS, column : column + PIXELS] = True
@@ -77,7 +76,7 @@ def saturated_field(layout: Layout, goal_cell: tuple[int, int]) -> DistanceField
 
 def geodesic_field(layout: Layout, goal: np.ndarray) -> DistanceField:
     """The shortest path's length, meters, from the goal's position (x, y)."""
-    floor, _, _ = _floor(layout)
+    floor, _, _ = floor_of(layout)
     centers = (np.moveaxis(np.indices(floor.shape), 0, -1) + 0.5) / PIXELS - 0.5
     away = np.linalg.norm(layout.world(centers) - np.asarray(goal)[:2], axis=-1)
     start = 2 * CELL / PIXELS  # straight lines this near: a wave from a single pixel would be square

@@ -33,9 +33,6 @@ LAYOUTS = {
 """DMC-VB's seven layouts, rows joined by "/" (the authors' benchmark code)."""
 
 
-NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_]*$")
-
-
 @dataclass(frozen=True)
 class Layout:
     """A checked layout.
@@ -101,13 +98,7 @@ def make_layout(name: str, text: str) -> Layout:
     Raises:
       LayoutError: a wrong character, ragged rows, a hole in the outer wall, floor that is not connected.
     """
-    if not NAME.match(name):
-        raise LayoutError(f"layout name {name!r}: use letters, digits and underscores")
-    rows = [row.rstrip("\r") for row in re.split(r"[\n/]", text)]
-    while rows and not rows[-1].strip():
-        rows.pop()
-    while rows and not rows[0].strip():
-        rows.pop(0)
+    rows = re.split(r"\r?\n|/", text.strip("\r\n/"))
     width = max((len(row) for row in rows), default=0)
     for number, row in enumerate(rows):
         wrong = set(row) - set("* .")

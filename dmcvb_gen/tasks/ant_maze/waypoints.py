@@ -11,7 +11,7 @@ import functools
 
 import numpy as np
 
-from dmcvb_gen.tasks.ant_maze.distance import PIXELS, floor_pixels, saturated_field
+from dmcvb_gen.tasks.ant_maze.distance import PIXELS, floor_of, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 
 CLEARANCE = 1.25
@@ -32,7 +32,7 @@ def _downhill(layout: Layout, goal_cell: tuple[int, int]) -> np.ndarray:
 
     The saturated field is fast in the middle of corridors, so the way keeps clear of walls.
     """
-    floor, _ = floor_pixels(layout)
+    floor, _, _ = floor_of(layout)
     values = np.where(floor, saturated_field(layout, goal_cell).values, np.inf)
     padded = np.pad(values, 1, constant_values=np.inf)
     height, width = values.shape
@@ -49,7 +49,7 @@ def _downhill(layout: Layout, goal_cell: tuple[int, int]) -> np.ndarray:
 @functools.cache
 def _clearance(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """(row, column) distance of every pixel to the nearest wall, meters; (row, column, 2) unit x and y away from it."""
-    floor, _ = floor_pixels(layout)
+    floor, _, _ = floor_of(layout)
     from scipy import ndimage  # scipy takes a fifth of a second, which commands that list or show need not wait for
 
     clear = ndimage.distance_transform_edt(floor) * CELL / PIXELS
@@ -76,7 +76,7 @@ def headings(layout: Layout, positions: np.ndarray, goals: np.ndarray, ahead: fl
     Raises:
       LayoutError: a goal is in a wall.
     """
-    floor, nearest = floor_pixels(layout)
+    floor, _, nearest = floor_of(layout)
     clear, away = _clearance(layout)
     height, width = floor.shape
     cells = np.rint(layout.grid(goals)).astype(int)
