@@ -6,7 +6,7 @@ The engine, the checks and the readers that render on demand share it.
 from __future__ import annotations
 
 import atexit
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -156,83 +156,22 @@ def paint(
       (name, (episode, rows, size, size, 3) uint8); rows past an episode's end stay zero.
     """
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
-    size, total = renderer.size, len(episode)
+    shape = (len(physics), rows, renderer.size, renderer.size, 3)
     names = zip(picture_arrays(task.views), picture_arrays(task.views, hide_goal=True), strict=True)
     for view, (name, hidden_name) in zip(task.views, names, strict=True):
-        if arrays is not None and name not in arrays and hidden_name not in arrays:
-            continue
-        picture, without_goal = np.zeros((len(physics), rows, size, size, 3), np.uint8), []
-        hides, seen = bool(task.goal_geoms) and (arrays is None or hidden_name in arrays), np.zeros(0, int)
-        spans: list = []
-        if hides:
-            seen = _goal_in_sight(task, view, physics[episode, row], exogenous[episode, row])
-            seen, spans = _spans_of_one_background(task, view, size, physics, exogenous, episode, row, seen)
-        for first in range(0, total, PAINT_FRAMES):
-            frames = np.arange(first, min(first + PAINT_FRAMES, total))
-            twice = np.isin(frames, seen)
-            for both, some in ((False, frames[~twice]), (True, frames[twice])):
-                if len(some):
-                    e, r = episode[some], row[some]
-                    paint_them: Callable[..., Any] = renderer.render_pair if both else renderer.render
-                    painted = paint_them(physics[e, r], exogenous[e, r], views=[view])
-                    picture[e, r] = (painted[0] if both else painted)[:, 0]
-                    without_goal += [(e, r, painted[1][:, 0])] if both else []
-            progress(len(frames))
-        if arrays is None or name in arrays:
-            yield name, picture
-        if not hides:
-            continue
-        shown = [picture[e, rows[0]].copy() for e, rows in spans]
-        hidden = picture
-        for e, r, frames in without_goal:
-            hidden[e, r] = frames
-        for (one, rows_of), before in zip(spans, shown, strict=True):
-            behind = hidden[one, rows_of[0]]
-            covered = (behind != before).any(axis=-1, keepdims=True)
-            hidden[one, rows_of[1:]] = np.where(covered, behind, hidden[one, rows_of[1:]])
-        yield hidden_name, hidden
-
-
-def _goal_in_sight(task: Task, view: str, physics: np.ndarray, exogenous: DistractorState) -> np.ndarray:
-    """Indices of the frames in which the goal or its shadow may change a pixel; in the others it is unseen."""
-    if not hasattr(task, "goal_in_sight"):
-        return np.arange(len(physics))
-    return np.flatnonzero(task.goal_in_sight(view, physics, exogenous))
-
-
-def _spans_of_one_background(
-    task: Task,
-    view: str,
-    size: int,
-    physics: np.ndarray,
-    exogenous: DistractorState,
-    episode: np.ndarray,
-    row: np.ndarray,
-    seen: np.ndarray,
-) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
-    """Frames that need no picture of their own with the goal hidden.
-
-    If the camera stands still, and nothing that moves is near the goal, what is behind the goal is the same in
-    every frame of an episode: one hidden picture tells it for all.
-
-    Returns:
-      What is left of `seen`, and (episode, rows): hide the goal in the first of the rows, copy its pixels to the rest.
-    """
-    if not len(seen) or not hasattr(task, "goal_alone"):
-        return seen, []
-    index = task.views.index(view)
-    alone = np.zeros(len(episode), bool)
-    alone[seen] = task.goal_alone(physics[episode[seen], row[seen]], size)
-    spans = []
-    for e in np.unique(episode[seen]):
-        frames = np.flatnonzero(alone & (episode == e))
-        poses = [field[e, row[frames], index] for field in (exogenous.camera_position, exogenous.camera_quaternion)]
-        if len(frames) > 1 and all((pose == pose[0]).all() for pose in poses):
-            spans.append((int(e), row[frames]))
-            alone[frames[0]] = False
-        else:
-            alone[frames] = False
-    return seen[~alone[seen]], spans
+        shown = arrays is None or name in arrays
+        hidden = bool(task.goal_geoms) and (arrays is None or hidden_name in arrays)
+        images = {each: np.zeros(shape, np.uint8) for each in [name] * shown + [hidden_name] * hidden}
+        for first in range(0, len(episode) * bool(images), PAINT_FRAMES):
+            e, r = (index[first : first + PAINT_FRAMES] for index in (episode, row))
+            if shown and hidden:
+                painted = renderer.render_pair(physics[e, r], exogenous[e, r], [view])
+            else:
+                painted = (renderer.render(physics[e, r], exogenous[e, r], [view], hide_goal=hidden),)
+            for image, frames in zip(images.values(), painted, strict=True):
+                image[e, r] = frames[:, 0]
+            progress(len(e))
+        yield from images.items()
 
 
 def len_rows(exogenous: DistractorState) -> int:

@@ -7,12 +7,7 @@ import pytest
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
-from dmcvb_gen.generate.engine import paint
-from dmcvb_gen.policies.bundled import bundled_policies
-from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.release.verify import verify
-from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from tests.conftest import TINY_MAZE, maze_recipe, roll_out
@@ -56,75 +51,6 @@ def test_fixed_goals(tmp_path):
         assert np.abs(at[:2] - task.layout.world(start)).max() <= 0.25 + 1e-6
         assert np.abs(to[:2] - task.layout.world(goal)).max() <= 0.5 + 1e-6
     assert (starts[0] != starts[1]).all() and (goals[0, :2] != goals[1, :2]).all()
-
-
-def frames(task, seed, count):
-    """Physics states and labels of the starts of `count` episodes."""
-    batch = task.batch(count)
-    batch.reset([np.random.default_rng([seed, i]) for i in range(count)])
-    physics = batch.physics()
-    generators = {"style": [np.random.default_rng(i) for i in range(count)]}
-    return physics, sample_distractors(task, DistractorSetting(), physics[:, None], generators)[:, 0]
-
-
-@pytest.mark.slow_cases("opengl")
-@pytest.mark.parametrize("name", ["native", "opengl"])
-def test_hidden_pictures_differ_only_where_the_goal_is_in_sight(name):
-    reason = available_renderers()[name]
-    if reason:
-        pytest.skip(reason)
-    task = get_task("ant-maze-easy7x7b")
-    physics, labels = frames(task, 7, 24)
-    renderer = make_renderer(name, task, 32)
-    visible, hidden = renderer.render(physics, labels), renderer.render(physics, labels, hide_goal=True)
-    renderer.close()
-    seen_anywhere = 0
-    for column, view in enumerate(task.views):
-        differs = (visible[:, column] != hidden[:, column]).any(axis=(1, 2, 3))
-        in_sight = task.goal_in_sight(view, physics, labels)
-        assert not (differs & ~in_sight).any()
-        seen_anywhere += int((~in_sight).sum())
-        if view == "top":
-            assert differs.all()
-    assert seen_anywhere > 10  # pictures that need no second rendering
-
-
-@pytest.mark.slow_cases("opengl")
-@pytest.mark.parametrize("name", ["opengl"])
-def test_shared_backgrounds_give_the_pictures_that_painting_each_frame_gives(name):
-    reason = available_renderers()[name]
-    if reason:
-        pytest.skip(reason)
-    task = get_task("ant-maze-empty7x7")
-    policy = load_policy(bundled_policies(task.id, "expert")[0], task)
-    far = [((2, 1), (4, 5))]
-    run = simulate(task, [policy], range(3), 4, (task.id,), max_steps=200, goal_pairs=far, episodes_per_goal=3)
-    assert run.terminated.any()  # the goal is reached in one of them, so the ant is far from it and beside it
-    physics, length = run.physics[:, :201], run.length
-    generators = {"style": [np.random.default_rng(i) for i in range(3)]}
-    labels = sample_distractors(task, DistractorSetting(), filled(physics, length), generators)
-    renderer, asked = make_renderer(name, task, 32), []
-    render = renderer.render
-
-    def counting(physics, exogenous, views=None, hide_goal=False):
-        if hide_goal:
-            asked.append((views[0], len(physics)))
-        return render(physics, exogenous, views=views, hide_goal=hide_goal)
-
-    renderer.render = counting
-    painted = {name: picture.copy() for name, picture in paint(task, renderer, physics, labels, length, 201)}
-    episode, row = np.nonzero(np.arange(201)[None] <= length[:, None])
-    every = render(physics[episode, row], labels[episode, row], hide_goal=True)
-    renderer.close()
-    for column, view in enumerate(task.views):
-        np.testing.assert_array_equal(painted[f"pixels_hidden_goal/{view}"][episode, row], every[:, column])
-    assert sum(count for view, count in asked if view == "top") < len(episode) / 2
-
-
-def filled(physics, length):
-    """Physics states with the last one of an episode repeated past its end."""
-    rows = np.minimum(np.arange(physics.shape[1])[None], length[:, None])
-    return np.take_along_axis(physics, rows[..., None], axis=1)
 
 
 def test_styles_of_data_and_of_evaluation_are_apart():

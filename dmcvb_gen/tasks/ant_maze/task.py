@@ -20,15 +20,13 @@ from dmcvb_gen.tasks.ant_maze.arena import (
     GOAL_HEIGHT,
     GOAL_RADIUS,
     STYLES,
-    TOP_HEIGHT,
     build_arena,
     look_numbers,
     textured_model,
 )
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, make_field
-from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
-from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, PhysicsBatch, Task
-from dmcvb_gen.tasks.cameras import matrices
+from dmcvb_gen.tasks.ant_maze.layouts import Layout
+from dmcvb_gen.tasks.base import ACTION_REPEAT, PhysicsBatch, Task
 
 EPISODE_STEPS, EVALUATION_STEPS = 600, 1000
 """Agent steps of 30 seconds (data) and of 60 seconds (online evaluation)."""
@@ -340,41 +338,5 @@ class AntMaze(Task):
     def style_geom_matid(self, look):
         return build_arena(self.layout).looks.get(look)
 
-    def goal_in_sight(self, view: str, physics: np.ndarray, exogenous) -> np.ndarray:
-        """(frame,) bool: whether the goal's sphere reaches into the picture (walls may still hide it).
-
-        Args:
-          physics: (frame, physics) float64.
-          exogenous: labels with leading shape (frame,).
-        """
-        index = self.views.index(view)
-        fovy = np.radians(self.model.cam_fovy[self.model.camera(self.cameras[index]).id])
-        goal = physics[:, _mocap_columns(self.model)] + [0, 0, GOAL_HEIGHT]
-        turned = matrices(exogenous.camera_quaternion[:, index].astype(np.float64))
-        seen = ((goal - exogenous.camera_position[:, index])[:, None] @ turned)[:, 0]
-        depth, aside = -seen[:, 2], np.linalg.norm(seen[:, :2], axis=1)
-        angle = np.arctan(np.sqrt(2) * np.tan(fovy / 2))  # of the picture's corners
-        outside = aside * np.cos(angle) - depth * np.sin(angle)  # distance from the cone around the picture
-        return outside < GOAL_RADIUS * 1.01
-
-    def goal_alone(self, physics: np.ndarray, size: int) -> np.ndarray:
-        """(frame,) bool: the ant is so far from the goal that no pixel of the top view can have both.
-
-        Args:
-          size: pixels a side.
-        """
-        goal = physics[:, _mocap_columns(self.model)][:, :2]
-        away = np.linalg.norm(physics[:, 1:3] - goal, axis=1)  # time is first, then x and y of the torso
-        extent = max(self.layout.shape) * CELL
-        leaning = 2 * extent / TOP_HEIGHT  # ant and goal reach about 1.5 m up
-        return away > REACH + leaning + 2 * extent / size
-
     def batch(self, size: int, threads: int = 1) -> AntMazeBatch:
         return AntMazeBatch(self, size, threads)
-
-
-def _mocap_columns(model: mujoco.MjModel) -> slice:
-    """Return the columns of the goal's position in a physics state (`PHYSICS_SPEC`)."""
-    before = PHYSICS_SPEC & (int(mujoco.mjtState.mjSTATE_MOCAP_POS) - 1)
-    start = mujoco.mj_stateSize(model, before)
-    return slice(start, start + 3)
