@@ -11,8 +11,12 @@ from numba import njit
 _log = logging.getLogger(__name__)
 
 
-def kept_njit(**options: Any) -> Callable[[Callable], Any]:
-    """numba's `njit(cache=True, ...)`, which goes on without the cache if it cannot be read or written."""
+def kept_njit(version: str = "", **options: Any) -> Callable[[Callable], Any]:
+    """numba's `njit(cache=True, ...)`, which goes on without the cache if it cannot be read or written.
+
+    Args:
+      version: code that was kept under another one is not read; numba itself looks at the date of one file alone.
+    """
 
     def decorate(function: Callable) -> Any:
         compiled = njit(**options)(function)
@@ -22,6 +26,8 @@ def kept_njit(**options: Any) -> Callable[[Callable], Any]:
             _log.info("%s is compiled in every process: numba has no folder to keep it in", function.__name__)
             return compiled
         cache = compiled._cache
+        key_of = cache._index_key
+        cache._index_key = lambda signature, codegen: (*key_of(signature, codegen), version)
         cache.load_overload = _forgiving(cache.load_overload)
         cache.save_overload = _forgiving(cache.save_overload)
         return compiled

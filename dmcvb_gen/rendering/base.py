@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
+from importlib import metadata
 from typing import Any
 
 import mujoco
@@ -29,6 +30,8 @@ class Renderer(abc.ABC):
     name: str
     task: Task
     size: int
+    samples: int
+    floor_alpha: float
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -73,9 +76,14 @@ class Renderer(abc.ABC):
         """
         raise NotImplementedError
 
-    @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Name, version and every setting that decides a pixel, for the manifest."""
+        """Name and every setting that decides a pixel, for the manifest."""
+        return {
+            "name": self.name,
+            "samples": self.samples,
+            "floor_alpha": self.floor_alpha,
+            "mujoco": metadata.version("mujoco"),
+        }
 
     def close(self) -> None:  # noqa: B027  (a renderer may hold nothing)
         """Free what the renderer holds; it cannot be used afterwards."""

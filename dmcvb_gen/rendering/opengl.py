@@ -13,7 +13,6 @@ import importlib
 import os
 import subprocess
 import sys
-from importlib import metadata
 from typing import Any
 
 import mujoco
@@ -92,8 +91,7 @@ class OpenglRenderer(Renderer):
         self._backgrounds = backgrounds
         self._model = copy.deepcopy(task.picture_model)  # materials and textures change frame by frame
         self._model.vis.global_.offwidth = self._model.vis.global_.offheight = size
-        self._model.vis.quality.offsamples = 4 if samples is None else samples
-        self._samples = int(self._model.vis.quality.offsamples)
+        self._model.vis.quality.offsamples = self.samples = 4 if samples is None else samples
         skies = np.flatnonzero(self._model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = int(skies[0]) if len(skies) else -1
         if self._sky >= 0:
@@ -111,14 +109,6 @@ class OpenglRenderer(Renderer):
         self._painter = _painter(self._model, size)
         self._terrain_changes = task.draws_terrain or "hfield_data" in task.model_entries
         self._shown: tuple[int, int] = (-1, -1)
-
-    def describe(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "samples": self._samples,
-            "floor_alpha": self.floor_alpha,
-            "mujoco": metadata.version("mujoco"),
-        }
 
     def render(
         self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False

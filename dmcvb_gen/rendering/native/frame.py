@@ -7,22 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dmcvb_gen.kept import kept_njit
 from dmcvb_gen.rendering.native import layout as L
-from dmcvb_gen.rendering.native.layout import distinct, get, leaf, part, put, put3, stage
-from dmcvb_gen.rendering.native.lighting import aim_shadows, light_vertices
+from dmcvb_gen.rendering.native import lighting, shading, visibility
+from dmcvb_gen.rendering.native.layout import distinct, entry, get, leaf, part, put, put3, stage
 from dmcvb_gen.rendering.native.scene import CAPSULE, OPAQUE, PLANE, SPHERE
-from dmcvb_gen.rendering.native.shading import aim, cover, set_color, shade_body, shade_plane, shade_sky
-from dmcvb_gen.rendering.native.visibility import (
-    NOTHING,
-    box_of_body,
-    box_of_plane,
-    draw_capsule,
-    draw_plane,
-    draw_solid,
-    draw_sphere,
-    plane_functions,
-)
+from dmcvb_gen.rendering.native.visibility import NOTHING
 
 f4, i4, i8 = np.float32, np.int32, np.int64
 BACK_OF_PLANE = 0.3
@@ -132,9 +121,8 @@ def turned(axes, f, row, x, y, z):
 @part
 def pose_geoms(rec, looks, center, turn, eye, axes, rgb, look, f):
     """Fill the records of frame f."""
+    rec[:, : looks.shape[2]] = looks[look]
     for g in range(rec.shape[0]):
-        for column in range(looks.shape[2]):
-            rec[g, column] = looks[look, g, column]
         x, y, z = center[f, g, 0] - eye[f, 0], center[f, g, 1] - eye[f, 1], center[f, g, 2] - eye[f, 2]
         for row in range(3):
             rec[g, L.PLACE + row] = turned(axes, f, row, x, y, z)
@@ -149,10 +137,8 @@ def pose_geoms(rec, looks, center, turn, eye, axes, rgb, look, f):
                 rec[g, L.TURN + 3 * row + 2] /= rec[g, L.SIZE + 1]
         for row in range(3):
             rec[g, L.AXIS + row] = rec[g, L.TURN + 3 * row + 2]
-        material = int(rec[g, L.MATERIAL])
-        if material >= 0:
-            for c in range(3):
-                rec[g, L.RGB + c] = rgb[f, material, c]
+        if rec[g, L.MATERIAL] >= 0.0:
+            rec[g, L.RGB : L.RGB + 3] = rgb[f, int(rec[g, L.MATERIAL])]
 
 
 @part
@@ -160,17 +146,16 @@ def face_planes(rec):
     """Fill the planes' FUNCTIONS, and their OPACITY from the side that is seen."""
     for g in range(rec.shape[0]):
         if rec[g, L.KIND] == PLANE:
-            rec[g, L.OPACITY] = rec[g, L.OWN_OPACITY] * (1.0 if plane_functions(rec, g) else BACK_OF_PLANE)
+            facing = visibility.plane_functions(rec, g)
+            rec[g, L.OPACITY] = rec[g, L.OWN_OPACITY] * (1.0 if facing else BACK_OF_PLANE)
 
 
 @part
 def choose_lamp(k, constants, lamps, lamp, eye, axes, f, which):
     """Fill the lamp's entries of k with one of the lamps; the headlight shines with the first one alone."""
+    k[L.SPOT : L.SPOT + 12] = lamps[which]
     for i in range(9):
-        k[L.SPOT + i] = lamps[which, i]
         k[L.HEADLIGHT + i] = constants[L.HEADLIGHT + i] if which == 0 else 0.0
-    for i in range(3):
-        k[L.CONE + i] = lamps[which, 9 + i]
     x, y, z = lamp[f, which, 0] - eye[f, 0], lamp[f, which, 1] - eye[f, 1], lamp[f, which, 2] - eye[f, 2]
     for row in range(3):
         k[L.LAMP + row] = turned(axes, f, row, x, y, z)
@@ -212,7 +197,7 @@ def swap_with_image(rec, g):
     ):
         for i in range(count):
             rec[g, there + i], rec[g, here + i] = rec[g, here + i], rec[g, there + i]
-    return plane_functions(rec, g)
+    return visibility.plane_functions(rec, g)
 
 
 @part
@@ -239,17 +224,17 @@ def drawn(rec, g, which):
 @part
 def draw_body(inverse, number, rays, k, rec, g, place, axis):
     """Draw a body; its center and axis are in these columns of its record."""
-    c0, c1, r0, r1 = box_of_body(k, rec, g, place, axis, rays.size // 9)
+    c0, c1, r0, r1 = visibility.box_of_body(k, rec, g, place, axis, rays.size // 9)
     if c0 >= c1 or r0 >= r1:
         return
     nearest, geom = 1.0 / k[L.NEAR], np.uint8(g)
     if rec[g, L.KIND] == CAPSULE:
-        draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
+        visibility.draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
     elif rec[g, L.KIND] == SPHERE:
-        draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
+        visibility.draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
     else:
         turn = i8(L.TURN if place == L.PLACE else L.MIRRORED_TURN)
-        draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom)
+        visibility.draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom)
 
 
 @part
@@ -260,14 +245,20 @@ def draw_bodies(inverse, number, rays, k, rec, which, place, axis):
             draw_body(inverse, number, rays, k, rec, g, place, axis)
 
 
-@stage
+@part
+def draw_seen_plane(inverse, number, rays, k, rec, g):
+    """Draw a plane where it can be seen."""
+    c0, c1, r0, r1 = visibility.box_of_plane(k, rec, g, k[L.NEAR], rays.size // 9)
+    if c0 < c1 and r0 < r1:
+        visibility.draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
+
+
+@part
 def draw_planes(inverse, number, rays, k, rec, opaque):
     """Draw the planes that are opaque, or the others."""
     for g in range(rec.shape[0]):
         if rec[g, L.KIND] == PLANE and (rec[g, L.OPACITY] >= OPAQUE) == opaque:
-            c0, c1, r0, r1 = box_of_plane(k, rec, g, k[L.NEAR], rays.size // 9)
-            if c0 < c1 and r0 < r1:
-                draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
+            draw_seen_plane(inverse, number, rays, k, rec, g)
 
 
 @part
@@ -276,9 +267,7 @@ def draw_mirrored_planes(inverse, number, rays, k, rec):
     for g in range(rec.shape[0]):
         if rec[g, L.KIND] == PLANE and g != int(k[L.MIRROR]):
             if swap_with_image(rec, g):
-                c0, c1, r0, r1 = box_of_plane(k, rec, g, k[L.NEAR], rays.size // 9)
-                if c0 < c1 and r0 < r1:
-                    draw_plane(inverse, number, rays, c0, c1, r0, r1, k, rec, g, np.uint8(g))
+                draw_seen_plane(inverse, number, rays, k, rec, g)
             swap_with_image(rec, g)
 
 
@@ -459,20 +448,20 @@ def shade_geom(scene, scratch, pixels, which, g, mirrored, veil, further):
     s, k, rec, jobs, color = scratch.s, scratch.k, scratch.rec, scratch.jobs, scratch.color
     geoms, room = rec.shape[0], room_for(pixels)
     first, total = lists_at(room, geoms, which, g), np.int64(get(jobs, length_at(room, geoms, which, g)))
-    set_color(k, rec, g, k[L.REFLECTANCE] if mirrored else 1.0)
+    shading.set_color(k, rec, g, k[L.REFLECTANCE] if mirrored else 1.0)
     for at in range(first, first + total, L.CHUNK):
         n = min(L.CHUNK, first + total - at)
-        aim(s, n, jobs, room, at, pixels, k[L.STEP])
+        shading.aim(s, n, jobs, room, at, pixels, k[L.STEP])
         take_base(s, n, jobs, color, room, at)
         if rec[g, L.KIND] == PLANE:
             if mirrored:
                 swap_with_image(rec, g)
-            shade_plane(s, n, k, rec, scene.texels, scene.width, scratch.plane, g, mirrored)
+            shading.shade_plane(s, n, k, rec, scene.texels, scene.width, scratch.plane, g, mirrored)
             if mirrored:
                 swap_with_image(rec, g)
         else:
-            shade_body(s, n, k, rec, scene.texels, scene.width, g, mirrored)
-        cover(s, n, k, rec, g, veil, further)
+            shading.shade_body(s, n, k, rec, scene.texels, scene.width, g, mirrored)
+        shading.cover(s, n, k, rec, g, veil, further)
         give_base(s, n, jobs, color, room, at)
 
 
@@ -482,8 +471,8 @@ def shade_sky_jobs(s, k, texels, width, jobs, color, pixels, first, total):
     room = room_for(pixels)
     for at in range(first, first + total, L.CHUNK):
         n = min(L.CHUNK, first + total - at)
-        aim(s, n, jobs, room, at, pixels, k[L.STEP])
-        shade_sky(s, n, k, texels, width)
+        shading.aim(s, n, jobs, room, at, pixels, k[L.STEP])
+        shading.shade_sky(s, n, k, texels, width)
         give_base(s, n, jobs, color, room, at)
 
 
@@ -556,7 +545,7 @@ def clip_to_some(k, rec, pixels, goal):
     left, right, top, bottom = pixels, 0, pixels, 0
     for g in range(rec.shape[0]):
         if rec[g, L.KIND] != PLANE and rec[g, L.GOAL] == goal and (goal or rec[g, L.MOVING] > 0.0):
-            c0, c1, r0, r1 = box_of_body(k, rec, g, i8(L.PLACE), i8(L.AXIS), pixels)
+            c0, c1, r0, r1 = visibility.box_of_body(k, rec, g, i8(L.PLACE), i8(L.AXIS), pixels)
             if c0 < c1 and r0 < r1:
                 left, right, top, bottom = min(left, c0), max(right, c1), min(top, r0), max(bottom, r1)
     if goal and (k[L.CONE] > 0.0 or k[L.MIRROR] >= 0.0):
@@ -587,12 +576,8 @@ def paint(scene, frames, scratch, f, which, inside, known, out):
 
 @part
 def same(array, f):
-    """Return True if array[f] is equal to array[f - 1], both (row, column)."""
-    for row in range(array.shape[1]):
-        for column in range(array.shape[2]):
-            if array[f, row, column] != array[f - 1, row, column]:
-                return False
-    return True
+    """Return True if array[f] is equal to array[f - 1]."""
+    return np.array_equal(array[f], array[f - 1])
 
 
 @part
@@ -606,14 +591,13 @@ def light_frame(scene, frames, scratch, f, which):
     """Make a lamp's light on the lit plane and its shadow map ready."""
     k, rec = scratch.k, scratch.rec
     choose_lamp(k, scene.constants, scene.lamps, frames.lamp, frames.eye, frames.axes, f, which)
-    for i in range(4):
-        k[L.WINDOW + i] = 0.0
+    k[L.WINDOW : L.WINDOW + 4] = 0.0
     if k[L.CONE] <= 0.0:
         return
-    aim_shadows(k, rec)
+    lighting.aim_shadows(k, rec)
     for g in range(rec.shape[0]):
         if rec[g, L.GRIDDED] > 0.0:
-            light_vertices(scratch.s, k, rec, scratch.plane, g, len(scene.lamps) > 1, which)
+            lighting.light_vertices(scratch.s, k, rec, scratch.plane, g, len(scene.lamps) > 1, which)
 
 
 @stage
@@ -621,9 +605,7 @@ def pose(scene, frames, scratch, f, pixels):
     """Transform everything of frame f into the camera's frame."""
     k, eye, axes = scratch.k, frames.eye, frames.axes
     pose_geoms(scratch.rec, scene.looks, frames.center, frames.turn, eye, axes, frames.rgb, frames.look[f], f)
-    for row in range(3):
-        for column in range(3):
-            k[L.VIEW + 3 * row + column] = axes[f, row, column]
+    k[L.VIEW : L.VIEW + 9] = axes[f].ravel()
     k[L.EYE], k[L.EYE + 1], k[L.EYE + 2], k[L.SKY] = 0.0, 0.0, -1.0, frames.sky[f]
     clip(k, i8(0), pixels, i8(0), pixels)
 
@@ -632,10 +614,10 @@ def pose(scene, frames, scratch, f, pixels):
 def looks_as_before(frames, f):
     """Return True if all that does not move looks in frame f as in the frame before it."""
     same_look = same_sky(frames.axes, frames.sky, f) and frames.look[f] == frames.look[f - 1]
-    return same_look and same(frames.eye.reshape(-1, 1, 3), f) and same(frames.rgb, f)
+    return same_look and same(frames.eye, f) and same(frames.rgb, f)
 
 
-@stage
+@entry
 def paint_frames(scene, frames, scratch, stays, shown, hidden):
     """Paint frames into `shown`, and without the goal into `hidden`, each (frame, pixels, pixels, 3) uint8, or of no
     frames if it is not wanted.
@@ -684,7 +666,7 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
             paint(scene, frames, scratch, f, which, inside, known, picture)
 
 
-@stage
+@entry
 def label_frames(scene, frames, scratch, depth, geom):
     """Depth (0: sky) and geom (-1: sky) of frames, from each pixel's first sample. Planes hide what is behind them."""
     k, rec, inverse, number = scratch.k, scratch.rec, scratch.inverse, scratch.number
@@ -704,25 +686,3 @@ def label_frames(scene, frames, scratch, depth, geom):
                 sky_there = number[sample] == NOTHING
                 depth[f, row, column] = np.float32(0) if sky_there else np.float32(1) / inverse[sample]
                 geom[f, row, column] = -1 if sky_there else number[sample]
-
-
-def painter(version: int):
-    """`paint_frames` compiled and kept on disk under a version: numba itself looks at one file's date alone."""
-
-    @kept_njit(nogil=True, error_model="numpy")
-    def paint_them(scene, frames, scratch, stays, shown, hidden):
-        if version != 0:
-            paint_frames(scene, frames, scratch, stays, shown, hidden)
-
-    return paint_them
-
-
-def labeler(version: int):
-    """`label_frames` compiled and kept on disk under a version."""
-
-    @kept_njit(nogil=True, error_model="numpy")
-    def label_them(scene, frames, scratch, depth, geom):
-        if version != 0:
-            label_frames(scene, frames, scratch, depth, geom)
-
-    return label_them

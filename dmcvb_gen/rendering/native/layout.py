@@ -13,16 +13,17 @@ depend neither on the processor nor on its neighbors. `call` keeps what is compi
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import logging
 import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
+
+from dmcvb_gen.kept import kept_njit
 
 CHUNK = 128
 """Places computed together, at most."""
@@ -30,11 +31,14 @@ CHUNK = 128
 _PLAIN = {"nogil": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """Nothing of what Python would need to call a part: making that takes a fifth of the time."""
 part = njit(**_PLAIN)
-"""For the parts of the entry points in `frame`, which alone are kept on disk."""
+"""For the parts of the entry points."""
 leaf = njit(forceinline=True, **_PLAIN)
 """For small parts: numba hands an array over as seven numbers or more, so a call can cost more than its work."""
 stage = njit(inline="always", **_PLAIN)
 """For parts that are called once and call others: LLVM works over a part again for each part around it."""
+_SOURCE = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+entry = kept_njit(version=hashlib.sha256(_SOURCE).hexdigest(), nogil=True, error_model="numpy")
+"""For the entry points, which are kept on disk as long as this package's source stays the same."""
 
 
 @intrinsic
@@ -92,24 +96,13 @@ def distinct(typing):
 _log = logging.getLogger(__name__)
 
 
-@functools.cache
-def _entry(factory: Callable):
-    """Return `factory(version)`; the version is the digest of all of this package's source."""
-    source = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    return factory(int.from_bytes(hashlib.sha256(source).digest()[:6], "little") | 1)
-
-
-def call(factory: Callable, *arguments) -> None:
+def call(function: Any, *arguments: Any) -> None:
     """Call an entry point; say so if it is compiled first."""
-    entry = _entry(factory)
-    if entry.signatures:
-        entry(*arguments)
-        return
-    started = time.perf_counter()
-    entry(*arguments)
-    seconds = time.perf_counter() - started
-    if sum(entry.stats.cache_misses.values()):
-        _log.info("compiled the painter in %.0f s; later runs read it from %s", seconds, entry.stats.cache_path)
+    first, started = not function.signatures, time.perf_counter()
+    function(*arguments)
+    if first and sum(function.stats.cache_misses.values()):
+        seconds = time.perf_counter() - started
+        _log.info("compiled the painter in %.0f s; later runs read it from %s", seconds, function.stats.cache_path)
 
 
 # -- columns of `rec`: what a look says of a geom

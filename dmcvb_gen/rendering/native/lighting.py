@@ -347,15 +347,9 @@ def terms(k, rec, g, light, c):
 @part
 def lamp_everywhere(s, n, k, rec, g, exponent):
     """Compute LAMP_COLOR on geom g of the color OWN from what `lamp_light` has computed, without a grid."""
+    distinct()
     raise_row(s, n, i8(L.LAMP_SPECULAR), exponent)
     raise_row(s, n, i8(L.CONE_FACTOR), int(k[L.CONE + 1]))
-    color_by_lamp(s, n, k, rec, g)
-
-
-@part
-def color_by_lamp(s, n, k, rec, g):
-    """See `lamp_everywhere`, whose rows are raised."""
-    distinct()
     one, spot = f4(1), i8(L.SPOT)
     flat_r, matt_r, glow_r = terms(k, rec, g, spot, 0)
     flat_g, matt_g, glow_g = terms(k, rec, g, spot, 1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from importlib import metadata
 from typing import Any
 
 import mujoco
@@ -14,7 +13,7 @@ from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering.base import Renderer, Views, check_frames, check_size, empty_labels, moved_lamps
 from dmcvb_gen.rendering.native import layout as L
-from dmcvb_gen.rendering.native.frame import Frames, SceneConstants, labeler, make_scratch, painter
+from dmcvb_gen.rendering.native.frame import Frames, SceneConstants, label_frames, make_scratch, paint_frames
 from dmcvb_gen.rendering.native.layout import call
 from dmcvb_gen.rendering.native.scene import PLANE, SUN_DISTANCE, Scene, records_of, scene_of
 from dmcvb_gen.rendering.native.textures import SKY_WIDTH, Textures
@@ -24,7 +23,6 @@ from dmcvb_gen.tasks.cameras import Kinematics, camera_ids, matrices
 
 VERSION = 2
 """Goes up when pictures change."""
-SAMPLES = 4
 CHUNK = 256
 """Frames whose poses are held at a time."""
 
@@ -37,6 +35,7 @@ class NativeRenderer(Renderer):
     """Renderer in compiled Python. One thread at a time may use a renderer; several renderers work side by side."""
 
     name = "native"
+    samples = 4
 
     @classmethod
     def check_task(cls, task):
@@ -44,37 +43,28 @@ class NativeRenderer(Renderer):
 
     def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
         check_size(size)
-        if samples not in (None, SAMPLES):
-            raise RenderingError(f"renderer 'native' takes {SAMPLES} samples a pixel, not {samples}; give none")
+        if samples not in (None, self.samples):
+            raise RenderingError(f"renderer 'native' takes {self.samples} samples a pixel, not {samples}; give none")
         self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
-        self._scene = scene_of(task)
+        self._scene = scene = scene_of(task)
         self._angles = np.radians(task.model.cam_fovy[camera_ids(task)]).tolist()
         finest = min(_finest_level(size, angle) for angle in self._angles)
         self._textures = Textures(task.picture_model, backgrounds, finest)
-        self._textures.make_ready(self._scene.sky)
+        self._textures.make_ready(scene.sky)
         self._looks: dict[int, int] = {}
-        self._records = np.zeros((0, len(self._scene.geoms), L.RGB + 3))
+        self._records = np.zeros((0, *scene.rec.shape))
         fields = ["geom_xpos", "geom_xmat"]
-        fields += ["site_xpos", "site_xmat"] * bool(len(self._scene.sites) or len(self._scene.cords))
-        fields += ["light_xpos", "light_xdir"] * bool(len(self._scene.lamps))
+        fields += ["site_xpos", "site_xmat"] * bool(len(scene.sites) or len(scene.cords))
+        fields += ["light_xpos", "light_xdir"] * bool(len(scene.lamps))
         self._kinematics = Kinematics(task, fields)
-        self._stays = (
-            self._scene.constants[L.MIRROR] < 0
-            and not len(self._scene.lamps)
-            and not self._scene.moving[self._scene.kind == PLANE].any()
-        )
-        sun = task.model.light_type[self._scene.lamps] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        moving_planes = scene.rec[scene.rec[:, L.KIND] == PLANE, L.MOVING]
+        self._stays = scene.constants[L.MIRROR] < 0 and not len(scene.lamps) and not moving_planes.any()
+        sun = task.model.light_type[scene.lamps] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
         self._far_away = np.where(sun, SUN_DISTANCE * task.model.stat.extent, 0.0)
-        self._scratch = make_scratch(len(self._scene.geoms), size, self._scene.grid)
+        self._scratch = make_scratch(len(scene.rec), size, scene.grid)
 
     def describe(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "version": VERSION,
-            "samples": SAMPLES,
-            "floor_alpha": self.floor_alpha,
-            "mujoco": metadata.version("mujoco"),
-        }
+        return super().describe() | {"version": VERSION}
 
     def render(
         self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
@@ -98,7 +88,7 @@ class NativeRenderer(Renderer):
             pictures = [np.empty((len(rows) * asked, *shape[1:]), np.uint8) for asked in (shown, hidden)]
             for column, view in enumerate(indices):
                 frames, scene = self._frames(poses, exogenous[rows], view), self._constants(view)
-                call(painter, scene, frames, self._scratch, self._stays, *pictures)
+                call(paint_frames, scene, frames, self._scratch, self._stays, *pictures)
                 for whole, part in zip(out, pictures, strict=True):
                     if len(part):
                         whole[rows, column] = part
@@ -118,7 +108,7 @@ class NativeRenderer(Renderer):
             geom = np.empty((len(rows), self.size, self.size), np.int16)
             for column, view in enumerate(indices):
                 frames, scene = self._frames(poses, exogenous[rows], view), self._constants(view, centers=True)
-                call(labeler, scene, frames, self._scratch, deep, geom)
+                call(label_frames, scene, frames, self._scratch, deep, geom)
                 depth[rows, column], segmentation[rows, column] = deep, numbers[geom]
         return {"depth": depth, "segmentation": segmentation}
 

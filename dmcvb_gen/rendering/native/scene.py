@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import mujoco
@@ -15,7 +16,6 @@ from dmcvb_gen.tasks.cameras import camera_ids
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 """MuJoCo's numbers of the kinds of geoms painted here."""
 _PAINTED = (PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
-_KIND_NAMES = {1: "height field", 7: "mesh", 8: "signed distance field"}
 SUN_DISTANCE = 25.0
 """A directional light is a lamp so far away, times the model's extent."""
 OPAQUE = 0.995
@@ -50,17 +50,13 @@ class Scene:
       geoms: (geom,) int64, the model's geoms that can be seen; -1 for sites and pieces of tendons.
       sites: the model's sites that can be seen.
       cords: (piece, 2) int64, the sites at the ends of the pieces of tendons.
-      kind: (geom,) int64, PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER or BOX.
+      rec: (geom, column) float64, the first columns of `layout`'s `rec`; those of a look are 0.
       material: (geom,) int64, of the model's own look; -1: none.
       rgba: (geom, 4) float32, the model's own colors without materials.
-      size: (geom, 3) float64, meters, half lengths as MuJoCo's.
-      moving: (geom,) bool; the others never move.
-      goal: (geom,) bool, left out of the hidden-goal pictures.
       lamps: indices of the lamps in the model.
       shine: (lamp, 12) float64, of each lamp ambient, diffuse and specular RGB, then the cosine of its cut-off angle,
         its exponent, and the tangent of its shadow map's half angle; one row of zeros without a lamp.
-      gridded: the plane that is lit at its vertices (the largest one), or -1.
-      grid: (2, line) float64, coordinates in that plane's frame of the vertices that it is drawn with.
+      grid: (2, line) float64, coordinates of the vertices that the plane is drawn with that is lit there, in its frame.
       boxes: (box, 6) float64, lowest and highest corner of the solid boxes behind walls (not drawn themselves).
       sky: texture of the sky, or -1.
       constants: float64, the first entries of `layout`'s `k`; STEP is 0, as it differs between views.
@@ -69,15 +65,11 @@ class Scene:
     geoms: np.ndarray
     sites: np.ndarray
     cords: np.ndarray
+    rec: np.ndarray
     material: np.ndarray
     rgba: np.ndarray
-    kind: np.ndarray
-    size: np.ndarray
-    moving: np.ndarray
-    goal: np.ndarray
     lamps: np.ndarray
     shine: np.ndarray
-    gridded: int
     grid: np.ndarray
     boxes: np.ndarray
     sky: int
@@ -92,7 +84,7 @@ def scene_of(task: Task) -> Scene:
     """
     model = task.picture_model
     geoms, sites, cords = _shown(model.geom_group), _visible_sites(model), _cords(task, model)
-    tendons = np.array([tendon for tendon, _, _ in cords], np.int64)
+    tendons, ends = cords[:, 0], cords[:, 1:]
     material = np.concatenate([model.geom_matid[geoms], model.site_matid[sites], model.tendon_matid[tendons]])
     rgba = np.concatenate([model.geom_rgba[geoms], model.site_rgba[sites], model.tendon_rgba[tendons]])
     kind = np.concatenate([model.geom_type[geoms], model.site_type[sites], np.full(len(cords), CAPSULE)])
@@ -104,19 +96,26 @@ def scene_of(task: Task) -> Scene:
     numbers = np.concatenate([geoms, np.full(len(sites) + len(cords), -1)])
     bodies = np.concatenate([model.geom_bodyid[geoms], model.site_bodyid[sites]])
     moving = np.concatenate([_moves(model, bodies), np.ones(len(cords), bool)])
-    ends = np.array([[one, two] for _, one, two in cords], np.int64).reshape(-1, 2)
-    geoms, kind, size = numbers[seen], kind[seen].astype(np.int64), size[seen]
+    geoms, kind, size = numbers[seen], kind[seen], size[seen]
     material, rgba = material[seen], rgba[seen]
     first, second = len(numbers) - len(sites) - len(cords), len(numbers) - len(cords)
     sites, ends = sites[seen[(seen >= first) & (seen < second)] - first], ends[seen[seen >= second] - second]
     _refuse_what_is_not_painted(task, material, kind, size, alpha[seen])
     shiny = _of_materials(model.mat_reflectance, material) * (kind == PLANE) * (material >= 0)
     mirror = np.flatnonzero(shiny)[:1]  # the first reflective plane
-    lamps = np.flatnonzero(model.light_active)
+    lamps, boxes = np.flatnonzero(model.light_active), _boxes(model)
+    grid, lines = np.zeros((2, 2)), np.zeros(2, np.int64)
+    rec = np.zeros((len(geoms), L.RGB + 3))
     planes = np.flatnonzero(kind == PLANE)
-    gridded = int(planes[np.argmax(size[planes, 0] * size[planes, 1])]) if len(planes) and len(lamps) else -1
-    grid, lines = _vertices(size[gridded]) if gridded >= 0 else (np.zeros((2, 2)), np.zeros(2, np.int64))
-    shine = [np.concatenate([_light(model, lamp), _cone(model, lamp)]) for lamp in lamps] or [np.zeros(12)]
+    if len(planes) and len(lamps):  # the largest plane is lit at its vertices
+        gridded = planes[np.argmax(size[planes, 0] * size[planes, 1])]
+        grid, lines = _vertices(size[gridded])
+        rec[gridded, L.GRIDDED] = 1
+    rec[:, L.KIND], rec[:, L.SIZE : L.SIZE + 3], rec[:, L.BALL] = kind, size, _ball_radius(kind, size)
+    rec[:, L.GOAL], rec[:, L.BOXED] = np.isin(geoms, task.goal_geoms), _boxed(model, geoms, boxes) & (kind == PLANE)
+    rec[:, L.MOVING] = moving[seen] | bool(task.model_entries)
+    rec[:, L.CORD] = np.arange(len(rec)) >= len(rec) - len(ends)
+    shine = [_shine(model, lamp) for lamp in lamps] or [np.zeros(12)]
     near, far = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     constants = np.zeros(L.HORIZON + 1)
@@ -128,17 +127,13 @@ def scene_of(task: Task) -> Scene:
         geoms=geoms,
         sites=sites,
         cords=ends,
+        rec=rec,
         material=material.astype(np.int64),
         rgba=rgba,
-        kind=kind,
-        size=size,
-        moving=moving[seen] | bool(task.model_entries),
-        goal=np.isin(geoms, task.goal_geoms),
         lamps=lamps,
         shine=np.array(shine),
-        gridded=gridded,
         grid=grid,
-        boxes=_boxes(model),
+        boxes=boxes,
         sky=int(skies[0]) if len(skies) else -1,
         constants=constants,
     )
@@ -150,7 +145,7 @@ def records_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> np.n
     Args:
       floor_alpha: opacity of the planes whose material is their own (below 1: the floor is seen through).
     """
-    model, material = task.picture_model, scene.material.copy()
+    model, material, rec = task.picture_model, scene.material.copy(), scene.rec.copy()
     chosen = task.style_geom_matid(style) if style >= 0 else None
     if chosen is not None:
         material[scene.geoms >= 0] = chosen[scene.geoms[scene.geoms >= 0]]
@@ -158,18 +153,12 @@ def records_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> np.n
     color = np.where(own[:, None], scene.rgba, _of_materials(model.mat_rgba, material)).astype(np.float64)
     textures = _of_materials(model.mat_texid, material)[:, mujoco.mjtTextureRole.mjTEXROLE_RGB]
     texture = np.where(material >= 0, textures, -1)
-    color[(scene.kind == PLANE) & ~own & (texture >= 0) & (floor_alpha < 1), 3] = floor_alpha
+    color[(rec[:, L.KIND] == PLANE) & ~own & (texture >= 0) & (floor_alpha < 1), 3] = floor_alpha
     uniform = _of_materials(model.mat_texuniform, material).astype(bool)[:, None]
     shininess = np.rint(128.0 * _of_materials(model.mat_shininess, material))
     shine = np.stack([_of_materials(model.mat_specular, material), shininess], axis=1)
     shine[material < 0] = 0.5, 64.0  # MuJoCo's defaults of a geom without a material
-    scale = np.where(uniform, 1.0, 1.0 / np.maximum(scene.size[:, :2], 1e-9))
-    rec = np.zeros((len(scene.geoms), L.RGB + 3))
-    rec[:, L.KIND], rec[:, L.SIZE : L.SIZE + 3] = scene.kind, scene.size
-    rec[:, L.GOAL], rec[:, L.BOXED] = scene.goal, _boxed(task, scene)
-    rec[:, L.MOVING], rec[:, L.BALL] = scene.moving, _ball_radius(scene)
-    rec[:, L.CORD] = np.arange(len(rec)) >= len(rec) - len(scene.cords)
-    rec[:, L.GRIDDED] = np.arange(len(rec)) == scene.gridded
+    scale = np.where(uniform, 1.0, 1.0 / np.maximum(rec[:, L.SIZE : L.SIZE + 2], 1e-9))
     rec[:, L.MATERIAL], rec[:, L.OWN_OPACITY] = np.where(own, -1, material), color[:, 3]
     rec[:, L.TEXTURE] = texture
     rec[:, L.REPEAT : L.REPEAT + 2] = 0.5 * _of_materials(model.mat_texrepeat, material) * scale
@@ -178,9 +167,8 @@ def records_of(task: Task, scene: Scene, style: int, floor_alpha: float) -> np.n
     return rec
 
 
-def _ball_radius(scene: Scene) -> np.ndarray:
+def _ball_radius(kind: np.ndarray, size: np.ndarray) -> np.ndarray:
     """(geom,) meters: of the ball around a body (around the end of a capsule)."""
-    size, kind = scene.size, scene.kind
     reach = {
         ELLIPSOID: size.max(axis=1),
         CYLINDER: np.hypot(size[:, 0], size[:, 1]),
@@ -189,11 +177,11 @@ def _ball_radius(scene: Scene) -> np.ndarray:
     return np.select([kind == each for each in reach], list(reach.values()), size[:, 0])
 
 
-def _boxed(task: Task, scene: Scene) -> np.ndarray:
-    """(geom,) bool: planes that lie on a side of a box."""
-    place = np.where(scene.geoms[:, None] >= 0, task.model.geom_pos[scene.geoms], np.inf)[:, None]
-    touching = (scene.boxes[None, :, :3] - 1e-6 <= place) & (place <= scene.boxes[None, :, 3:] + 1e-6)
-    return (scene.kind == PLANE) & touching.all(axis=2).any(axis=1)
+def _boxed(model: mujoco.MjModel, geoms: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """(geom,) bool: those whose place is in a box or on a side of it."""
+    place = np.where(geoms[:, None] >= 0, model.geom_pos[geoms], np.inf)[:, None]
+    touching = (boxes[None, :, :3] - 1e-6 <= place) & (place <= boxes[None, :, 3:] + 1e-6)
+    return touching.all(axis=2).any(axis=1)
 
 
 def _shown(groups: np.ndarray) -> np.ndarray:
@@ -226,8 +214,8 @@ def _of_materials(values: np.ndarray, material: np.ndarray) -> np.ndarray:
     return values[material] if len(values) else np.zeros((len(material), *values.shape[1:]), values.dtype)
 
 
-def _cords(task: Task, model: mujoco.MjModel) -> list[tuple[int, int, int]]:
-    """Pieces of the tendons that are drawn: tendon, and the sites at both ends.
+def _cords(task: Task, model: mujoco.MjModel) -> np.ndarray:
+    """(piece, 3) int64 of the pieces of tendons that are drawn: tendon, and the sites at both ends.
 
     Raises:
       RenderingError: a tendon that is wrapped around a geom.
@@ -241,31 +229,25 @@ def _cords(task: Task, model: mujoco.MjModel) -> list[tuple[int, int, int]]:
         if (kinds != mujoco.mjtWrap.mjWRAP_SITE).any():
             raise _not_painted(task, "tendons wrapped around geoms")
         sites = model.wrap_objid[wraps].tolist()
-        out += [(tendon, one, two) for one, two in zip(sites, sites[1:], strict=False)]
-    return out
+        out += [(tendon, *ends) for ends in itertools.pairwise(sites)]
+    return np.array(out, np.int64).reshape(-1, 3)
 
 
 def _not_painted(task: Task, what: str) -> RenderingError:
     return RenderingError(f"{task.id} has {what}, which 'native' does not paint; use --renderer opengl")
 
 
-def _is_special(model: mujoco.MjModel, camera: int) -> bool:
-    """Whether a camera is more than its field of view."""
-    perspective = model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
-    return not perspective or bool(model.cam_sensorsize[camera].any())
-
-
 def _refuse_what_is_not_painted(
     task: Task, material: np.ndarray, kind: np.ndarray, size: np.ndarray, alpha: np.ndarray
 ) -> None:
-    model = task.model
+    model, cameras = task.model, camera_ids(task)
     materials = np.unique(material[material >= 0])
     lights = np.flatnonzero(model.light_active)
-    others = [_KIND_NAMES.get(number, "unknown") for number in np.unique(kind).tolist() if number not in _PAINTED]
+    others = [mujoco.mjtGeom(number).name[7:].lower() for number in set(kind.tolist()) - set(_PAINTED)]
     textures = _of_materials(model.mat_texid, material)[:, mujoco.mjtTextureRole.mjTEXROLE_RGB]
     textures = np.where(material >= 0, textures, -1)
-    textured = (kind != PLANE) & (textures >= 0)
-    angular = (textures >= 0) & ~np.isin(kind, [SPHERE, ELLIPSOID])
+    textured, types = kind[textures >= 0], model.tex_type[textures[textures >= 0]]
+    fitting = np.where(textured == PLANE, mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtTexture.mjTEXTURE_CUBE)
     skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     channels = model.tex_nchannel[np.concatenate([textures[textures >= 0], skies])]
     changed = [name for name in task.model_entries if name.startswith(LOOKS)]
@@ -274,13 +256,17 @@ def _refuse_what_is_not_painted(
         "a skin": model.nskin > 0,
         "a flex": model.nflex > 0,
         f"{', '.join(changed)} of its own in each episode": bool(changed),
-        "a cube texture on a plane, a box, a cylinder or a capsule": bool(model.tex_type[textures[angular]].any()),
+        "a texture that is neither a picture on a plane nor a cube on a ball": bool(
+            (types != fitting).any() or not np.isin(textured, [PLANE, SPHERE, ELLIPSOID]).all()
+        ),
         "a texture that is not RGB": bool((channels != 3).any()),
         "mirrors that are no planes": bool(
             _of_materials(model.mat_reflectance, material)[(kind != PLANE) & (material >= 0)].any()
         ),
-        "an orthographic camera, or one with a sensor's size": any(_is_special(model, i) for i in camera_ids(task)),
-        "bodies with a texture that is no cube": bool((model.tex_type[textures[textured]] == 0).any()),
+        "an orthographic camera, or one with a sensor's size": bool(
+            (model.cam_projection[cameras] != mujoco.mjtProjection.mjPROJ_PERSPECTIVE).any()
+            or model.cam_sensorsize[cameras].any()
+        ),
         f"more than {MAX_GEOMS} geoms": len(kind) > MAX_GEOMS,
         "transparent bodies": bool((alpha[kind != PLANE] < 1).any()),
         "infinite planes": bool((size[kind == PLANE][:, :2] <= 0).any()),
@@ -302,20 +288,17 @@ def _headlight(model: mujoco.MjModel) -> np.ndarray:
     return np.concatenate([light.ambient, light.diffuse, light.specular]).astype(np.float64) * bool(light.active)
 
 
-def _light(model: mujoco.MjModel, lamp: int) -> np.ndarray:
-    parts = model.light_ambient[lamp], model.light_diffuse[lamp], model.light_specular[lamp]
-    return np.concatenate(parts).astype(np.float64)
-
-
-def _cone(model: mujoco.MjModel, lamp: int) -> np.ndarray:
-    if model.light_type[lamp] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
-        edge = float(model.vis.map.shadowclip) / SUN_DISTANCE * bool(model.light_castshadow[lamp])
-        return np.array([1e-6, 0.0, edge])
-    cutoff = float(model.light_cutoff[lamp])
-    shadow = min(2 * cutoff * float(model.vis.map.shadowscale), 160.0) / 2
+def _shine(model: mujoco.MjModel, lamp: int) -> np.ndarray:
+    """A row of `Scene.shine`."""
     casts = bool(model.light_castshadow[lamp])
-    angles = np.radians([cutoff, shadow])
-    return np.array([np.cos(angles[0]), float(model.light_exponent[lamp]), np.tan(angles[1]) * casts])
+    if model.light_type[lamp] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
+        cone = [1e-6, 0.0, float(model.vis.map.shadowclip) / SUN_DISTANCE * casts]
+    else:
+        cutoff = float(model.light_cutoff[lamp])
+        shadow = min(2 * cutoff * float(model.vis.map.shadowscale), 160.0) / 2
+        angles = np.radians([cutoff, shadow])
+        cone = [np.cos(angles[0]), float(model.light_exponent[lamp]), np.tan(angles[1]) * casts]
+    return np.concatenate([model.light_ambient[lamp], model.light_diffuse[lamp], model.light_specular[lamp], cone])
 
 
 def _vertices(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

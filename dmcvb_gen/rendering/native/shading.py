@@ -11,16 +11,9 @@ import math
 import numpy as np
 
 from dmcvb_gen.rendering.native import layout as L
+from dmcvb_gen.rendering.native import lighting
 from dmcvb_gen.rendering.native.layout import distinct, get, get3, leaf, part, put, put3, stage
-from dmcvb_gen.rendering.native.lighting import (
-    cast_shadows,
-    head_light,
-    lamp_everywhere,
-    lamp_light,
-    lamp_on_plane,
-    raise_row,
-    terms,
-)
+from dmcvb_gen.rendering.native.lighting import terms
 from dmcvb_gen.rendering.native.sampling import fill, sample_cube, sample_repeating
 from dmcvb_gen.rendering.native.scene import CAPSULE, CYLINDER, OPAQUE, PLANE, SPHERE
 from dmcvb_gen.rendering.native.visibility import half_length, own_point, through_solid
@@ -98,18 +91,18 @@ def shade_plane(s, n, k, rec, texels, width, plane, g, mirrored):
     for axis in range(3):
         fill(s, n, L.NORMAL + axis * L.CHUNK, f4(rec[g, L.AXIS + axis]))
     exponent = int(rec[g, L.EXPONENT])
-    head_light(s, n, k, i8(L.MIRRORED if mirrored else L.EYE), exponent)
+    lighting.head_light(s, n, k, i8(L.MIRRORED if mirrored else L.EYE), exponent)
     fill(s, n, i8(L.LIGHT), f4(0))
     if k[L.CONE] > 0.0:
         if rec[g, L.GRIDDED] > 0.0 and not mirrored:
-            lit = lamp_on_plane(s, n, k, rec, plane, g)
+            lit = lighting.lamp_on_plane(s, n, k, rec, plane, g)
         else:
-            lamp_light(s, n, k, i8(L.MIRRORED + 3 if mirrored else L.LAMP), exponent)
-            lamp_everywhere(s, n, k, rec, g, exponent)
+            lighting.lamp_light(s, n, k, i8(L.MIRRORED + 3 if mirrored else L.LAMP), exponent)
+            lighting.lamp_everywhere(s, n, k, rec, g, exponent)
             lit = not mirrored
         if lit and rec[g, L.OPACITY] >= OPAQUE:
-            cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
-    raise_row(s, n, i8(L.HEADLIGHT_SPECULAR), exponent)
+            lighting.cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
+    lighting.raise_row(s, n, i8(L.HEADLIGHT_SPECULAR), exponent)
 
 
 @part
@@ -237,23 +230,20 @@ def meet_solid(s, n, rec, g, place, turn):
 @part
 def meet(s, n, rec, g, mirrored):
     """Do as `meet_body` for any body or its mirror image."""
+    place = i8(L.MIRRORED_PLACE if mirrored else L.PLACE)
     if rec[g, L.KIND] == SPHERE or rec[g, L.KIND] == CAPSULE:
-        meet_body(
-            s, n, rec, g, i8(L.MIRRORED_PLACE if mirrored else L.PLACE), i8(L.MIRRORED_AXIS if mirrored else L.AXIS)
-        )
+        meet_body(s, n, rec, g, place, i8(L.MIRRORED_AXIS if mirrored else L.AXIS))
     else:
-        meet_solid(
-            s, n, rec, g, i8(L.MIRRORED_PLACE if mirrored else L.PLACE), i8(L.MIRRORED_TURN if mirrored else L.TURN)
-        )
+        meet_solid(s, n, rec, g, place, i8(L.MIRRORED_TURN if mirrored else L.TURN))
 
 
 @part
-def turn_rays(s, n, source_x, source_y, dx, dy):
-    """RAY_X and RAY_Y from two other rows, moved."""
+def turn_rays(s, n, source, dx, dy):
+    """RAY_X and RAY_Y from two rows from `source` on, moved."""
     for i in range(n):
-        put(s, L.RAY_X + i, get(s, source_x + i) + dx)
+        put(s, L.RAY_X + i, get(s, source + i) + dx)
     for i in range(n):
-        put(s, L.RAY_Y + i, get(s, source_y + i) + dy)
+        put(s, L.RAY_Y + i, get(s, source + L.CHUNK + i) + dy)
 
 
 @part
@@ -273,19 +263,16 @@ def own_directions(s, n, rec, g, first, less):
 @stage
 def cover_ball(s, n, k, rec, texels, width, g):
     """Sample the cube map around ball g along rays."""
-    step = f4(k[L.STEP])
-    turn_rays(s, n, i8(L.QUAD_X), i8(L.QUAD_Y), f4(0), f4(0))
-    meet(s, n, rec, g, False)
-    own_directions(s, n, rec, g, i8(L.DIRECTION), i8(-1))
-    turn_rays(s, n, i8(L.QUAD_X), i8(L.QUAD_Y), step, f4(0))
-    meet(s, n, rec, g, False)
-    own_directions(s, n, rec, g, i8(L.RIGHT), i8(L.DIRECTION))
-    turn_rays(s, n, i8(L.QUAD_X), i8(L.QUAD_Y), f4(0), step)
-    meet(s, n, rec, g, False)
-    own_directions(s, n, rec, g, i8(L.UP), i8(L.DIRECTION))
-    turn_rays(s, n, i8(L.X), i8(L.Y), f4(0), f4(0))
-    meet(s, n, rec, g, False)
-    own_directions(s, n, rec, g, i8(L.DIRECTION), i8(-1))
+    step = k[L.STEP]
+    for source, right, up, first, less in (
+        (L.QUAD_X, 0, 0, L.DIRECTION, -1),
+        (L.QUAD_X, 1, 0, L.RIGHT, L.DIRECTION),
+        (L.QUAD_X, 0, 1, L.UP, L.DIRECTION),
+        (L.X, 0, 0, L.DIRECTION, -1),
+    ):
+        turn_rays(s, n, source, f4(right * step), f4(up * step))
+        meet(s, n, rec, g, False)
+        own_directions(s, n, rec, g, first, less)
     sample_cube(s, n, texels, width, int(rec[g, L.TEXTURE]))
 
 
@@ -293,7 +280,7 @@ def cover_ball(s, n, k, rec, texels, width, g):
 def shade_body(s, n, k, rec, texels, width, g, mirrored):
     """Compute texture, headlight and lamp on body g, or on its mirror image, along rays."""
     exponent = int(rec[g, L.EXPONENT])
-    turn_rays(s, n, i8(L.X), i8(L.Y), f4(0), f4(0))
+    turn_rays(s, n, i8(L.X), f4(0), f4(0))
     if rec[g, L.TEXTURE] >= 0.0:
         cover_ball(s, n, k, rec, texels, width, g)
     else:
@@ -303,15 +290,15 @@ def shade_body(s, n, k, rec, texels, width, g, mirrored):
         meet(s, n, rec, g, True)
     elif rec[g, L.TEXTURE] < 0.0:
         meet(s, n, rec, g, False)
-    head_light(s, n, k, L.MIRRORED if mirrored else L.EYE, exponent)
+    lighting.head_light(s, n, k, i8(L.MIRRORED if mirrored else L.EYE), exponent)
     if k[L.CONE] > 0.0:
-        lamp_light(s, n, k, L.MIRRORED + 3 if mirrored else L.LAMP, exponent)
+        lighting.lamp_light(s, n, k, i8(L.MIRRORED + 3 if mirrored else L.LAMP), exponent)
         if not mirrored:
-            cast_shadows(s, n, k, rec, g)
-        lamp_everywhere(s, n, k, rec, g, exponent)
+            lighting.cast_shadows(s, n, k, rec, g)
+        lighting.lamp_everywhere(s, n, k, rec, g, exponent)
     else:
         fill(s, n, i8(L.LIGHT), f4(0))
-    raise_row(s, n, i8(L.HEADLIGHT_SPECULAR), exponent)
+    lighting.raise_row(s, n, i8(L.HEADLIGHT_SPECULAR), exponent)
 
 
 # -- sky -------------------------------------------------------------------------------------------

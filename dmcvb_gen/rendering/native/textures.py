@@ -13,9 +13,8 @@ import mujoco
 import numpy as np
 
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.kept import kept_njit
 from dmcvb_gen.rendering.native import layout as L
-from dmcvb_gen.rendering.native.layout import call, distinct, get, leaf, part, put
+from dmcvb_gen.rendering.native.layout import call, distinct, entry, get, leaf, part, put
 
 f4, i4 = np.float32, np.int32
 BITS = 22
@@ -104,7 +103,7 @@ def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.nd
         sizes = {"narrow": SKY_WIDTH * SKY_WIDTH, "tall": SKY_WIDTH * SKY_WIDTH, "all": total}
         room.update({name: np.empty(size, np.int32) for name, size in sizes.items()})
     across, down = taps(columns, SKY_WIDTH), taps(rows, SKY_WIDTH)
-    call(sky_maker, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], room["all"])
+    call(make_sky, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], room["all"])
     return room["all"]
 
 
@@ -127,13 +126,11 @@ class Textures:
         self._ready: set[int] = set()
         self._room: dict[str, np.ndarray] = {}
         self._slot: OrderedDict[tuple[int, int], int] = OrderedDict()
-        cubes = model.tex_type != mujoco.mjtTexture.mjTEXTURE_2D
-        textures = [
-            (level_sizes(width, width if cube else height), 6 if cube else 1, 0)
-            for width, height, cube in zip(
-                model.tex_width.tolist(), model.tex_height.tolist(), cubes.tolist(), strict=True
-            )
-        ]
+        textures = []
+        for texture in range(model.ntex):
+            width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
+            cube = model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D
+            textures.append((level_sizes(width, width if cube else height), 6 if cube else 1, 0))
         sky = level_sizes(SKY_WIDTH, SKY_WIDTH), 1, finest
         each = 4 * sum(width * height for width, height in sky[0][finest:])
         self.slots = int(np.clip(SKY_BYTES // each, 8, 256)) if backgrounds is not None else 0
@@ -285,27 +282,20 @@ def channel(texels, at, shift):
     return f4(i4((texels[at] >> shift) & 255))
 
 
-def sky_maker(version: int):
-    """Return a function that makes of (rows, columns, 3) uint8 the texels of `side` * `side` and of all smaller levels,
-    one after another; see `frame.painter`.
-    """
-
-    @kept_njit(nogil=True, error_model="numpy")
-    def make(picture, across, across_weight, down, down_weight, narrow, tall, out):
-        rows, columns, side = picture.shape[0], picture.shape[1], down.size
-        if version != 0:
-            for row in range(rows):
-                for x in range(columns):
-                    red, green, blue = i4(picture[row, x, 0]), i4(picture[row, x, 1]), i4(picture[row, x, 2])
-                    narrow[row * columns + x] = red | (green << 8) | (blue << 16)
-            widen(narrow, across, across_weight, rows, columns, side, tall)
-            heighten(tall, down, down_weight, side, side, out)
-            at = 0
-            while side > 1:
-                if side % 2 == 0:
-                    halve(out[at : at + side * side], side // 2, out[at + side * side :])
-                else:
-                    shrink(out[at : at + side * side], side, out[at + side * side :])
-                at, side = at + side * side, side // 2
-
-    return make
+@entry
+def make_sky(picture, across, across_weight, down, down_weight, narrow, tall, out):
+    """Make of (rows, columns, 3) uint8 the texels of `side` * `side` and of all smaller levels, one after another."""
+    rows, columns, side = picture.shape[0], picture.shape[1], down.size
+    for row in range(rows):
+        for x in range(columns):
+            red, green, blue = i4(picture[row, x, 0]), i4(picture[row, x, 1]), i4(picture[row, x, 2])
+            narrow[row * columns + x] = red | (green << 8) | (blue << 16)
+    widen(narrow, across, across_weight, rows, columns, side, tall)
+    heighten(tall, down, down_weight, side, side, out)
+    at = 0
+    while side > 1:
+        if side % 2 == 0:
+            halve(out[at : at + side * side], side // 2, out[at + side * side :])
+        else:
+            shrink(out[at : at + side * side], side, out[at + side * side :])
+        at, side = at + side * side, side // 2
