@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.tasks import cameras, get_task
-from dmcvb_gen.tasks.base import PHYSICS_SPEC
 from dmcvb_gen.tasks.cameras import Kinematics, centers_of_mass, matrices, nominal_cameras, quaternions
+from tests.conftest import TINY_MAZE
+from tests.tasks import hostile_tasks as h
+from tests.tasks.test_own_tasks import task_of
 
-TASKS = ("walker-walk", "ant-maze-tiny:****/*..*/****")
+TASKS = ("walker-walk", TINY_MAZE, h.sleeping, h.drawn_model, h.DrawsItsModel)
 FIELDS = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "subtree_com")
 
 
@@ -24,15 +27,16 @@ def some_states(task, count):
     return batch.physics()
 
 
-@pytest.mark.parametrize("task_id", TASKS)
-def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task_id):
-    task = get_task(task_id)
+@pytest.mark.parametrize("task", TASKS)
+def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task):
+    task = get_task(task) if isinstance(task, str) else task_of(task)
     physics = some_states(task, 5)
     together = Kinematics(task, FIELDS)(physics)
-    data = mujoco.MjData(task.model)
+    data, model = mujoco.MjData(task.model), copy.deepcopy(task.model)
     for frame, state in enumerate(physics):
-        mujoco.mj_setState(task.model, data, state, PHYSICS_SPEC)
-        mujoco.mj_forward(task.model, data)
+        task.apply_entries(model, state)
+        mujoco.mj_setState(model, data, state[: mujoco.mj_stateSize(model, task.physics_spec)], task.physics_spec)
+        mujoco.mj_forward(model, data)
         alone = Kinematics(task, FIELDS)(state[None])
         for name in FIELDS:
             expected = getattr(data, name)
@@ -42,22 +46,11 @@ def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task_id):
     assert centers_of_mass(task, physics[:0]).shape == (0, 3)
 
 
-def test_a_task_keeps_one_batch_of_the_size_that_was_asked_for(monkeypatch):
-    made = []
-    real = cameras.Batch
-    monkeypatch.setattr(
-        cameras, "Batch", lambda model, size, **options: made.append(size) or real(model, size, **options)
-    )
-    task = type(get_task("walker-walk"))()
-    one = some_states(task, 1)
-    for _ in range(3):
-        nominal_cameras(task, one)
-        centers_of_mass(task, one)
-    assert made == [1]
-    many = np.repeat(one, cameras.CHUNK + 88, axis=0)
-    position, _ = nominal_cameras(task, many)
-    assert made == [1, cameras.CHUNK]
-    assert (position == position[0]).all()
+def test_more_states_than_a_batch_holds_have_their_own_poses():
+    task = type(get_task("walker-walk"))()  # for which no batch is kept
+    few = some_states(task, 3)
+    expected, many = centers_of_mass(task, few), np.tile(few, (cameras.CHUNK // 2, 1))
+    np.testing.assert_array_equal(centers_of_mass(task, many), np.tile(expected, (cameras.CHUNK // 2, 1)))
 
 
 def test_threads_get_their_own_states_poses():

@@ -240,3 +240,28 @@ def test_a_model_without_materials_cannot_vary_its_colors(tmp_path, difficulty):
     task, physics = task_of(tmp_path, model(geom=None))
     with pytest.raises(DmcvbError, match="has no materials, so its colors cannot vary"):
         drawn_labels(task, DistractorSetting("dynamic", difficulty), physics[None])
+
+
+@pytest.mark.parametrize(("name", "share"), [("native", 0.999), pytest.param("opengl", 0.97, marks=needs_opengl)])
+def test_every_pixel_shows_the_geom_that_mujocos_ray_meets(name, share, tmp_path):
+    others = """<geom type="box" size=".2 .1 .3" pos=".5 .4 0" euler="20 30 0"/>
+    <geom type="sphere" size=".2" pos="-.6 -.4 0"/><geom type="ellipsoid" size=".2 .1 .3" pos="-.6 .4 0"/>
+    <geom type="capsule" size=".1 .2" pos=".6 -.4 0"/>"""
+    task, physics = task_of(tmp_path, model("cylinder", world=FLOOR + others))
+    renderer = make_renderer(name, task, 64)
+    found = renderer.render_labels(physics[:1], labels_of(task, physics[:1]))
+    world, data = task.model, mujoco.MjData(task.model)
+    mujoco.mj_setState(world, data, physics[0, : mujoco.mj_stateSize(world, task.physics_spec)], task.physics_spec)
+    mujoco.mj_forward(world, data)
+    slope = np.tan(np.radians(world.cam_fovy[0]) / 2) * ((np.arange(64) + 0.5) / 32 - 1)
+    met, meters = np.full((64, 64), -1), np.zeros((64, 64))
+    for row, column in np.ndindex(64, 64):
+        ray, geom = data.cam_xmat[0].reshape(3, 3) @ [slope[column], -slope[row], -1], np.zeros(1, np.int32)
+        meters[row, column] = mujoco.mj_ray(world, data, data.cam_xpos[0], ray, None, 1, -1, geom)
+        met[row, column] = geom[0]
+    renderer.close()
+    same = found["segmentation"][0, 0] == met
+    assert same.mean() > share and len(np.unique(met)) >= 7
+    seen = same & (met >= 0)
+    close = np.isclose(found["depth"][0, 0][seen], meters[seen], rtol=1e-3)
+    assert close.mean() > share and (found["depth"][0, 0][met < 0] == 0).mean() > share

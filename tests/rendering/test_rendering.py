@@ -11,7 +11,7 @@ from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.rendering import available_renderers, make_renderer
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks import get_task
 
 needs_opengl = pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
 FRAMES = 12
@@ -85,7 +85,7 @@ class RendererTests:
         if task_id == "humanoid-walk":
             assert changed[segmentation == task.model.geom("floor").id].mean() > 0.8
         else:  # pixels away from the sky's edge, which samples may touch; OpenGL has reflections
-            assert changed[~_near(segmentation == -1)].mean() <= (0.02 if self.name == "opengl" else 0.0)
+            assert changed[~near(segmentation == -1)].mean() <= (0.02 if self.name == "opengl" else 0.0)
 
     def test_labels_leave_a_hidden_goal_out_as_its_pictures_do(self):
         task, setting, physics, labels = frames_of("ant-maze-empty7x7", "none", 2)
@@ -113,32 +113,11 @@ class TestOpengl(RendererTests):
     name = "opengl"
 
 
-def _near(mask):
+def near(mask):
     """The mask grown by one pixel."""
-    out = mask.copy()
     for axis in (-1, -2):
-        for shift in (-1, 1):
-            out |= np.roll(mask, shift, axis)
-            mask = out.copy()
-    return out
-
-
-@needs_opengl
-@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
-def test_depth_and_segmentation_of_the_renderers_agree(task_id):
-    task, setting, physics, labels = frames_of(task_id, "none", 4)
-    found = {}
-    for name in ("native", "opengl"):
-        renderer = renderer_of(name, task, setting)
-        found[name] = renderer.render_labels(physics, labels)
-        renderer.close()
-    same = found["native"]["segmentation"] == found["opengl"]["segmentation"]
-    assert same.mean() > 0.93
-    for name, parts in found.items():  # OpenGL's depth at a body's edge is of another sample
-        assert ((parts["depth"] == 0) == (parts["segmentation"] == -1)).mean() > 0.98, name
-    both = same & (found["native"]["segmentation"] > 0) & (found["opengl"]["depth"] > 0)  # 0 is the floor
-    ratio = found["native"]["depth"][both] / found["opengl"]["depth"][both]
-    assert len(ratio) > 20 and np.median(np.abs(ratio - 1)) < 0.02
+        mask = mask | np.roll(mask, 1, axis) | np.roll(mask, -1, axis)
+    return mask
 
 
 def test_unknown_renderers_name_the_known_ones():

@@ -22,7 +22,6 @@ ARM = """<mujoco><option timestep="0.01"/>
 <actuator><motor name="first" joint="hinge" ctrlrange="-1 1"/><motor joint="wrist" ctrlrange="-1 1"/></actuator>
 <sensor><actuatorfrc actuator="first"/></sensor></mujoco>"""
 TRIPLE = [[1.0, 0.0], [0.0, 1.0], [0.5, -0.5]]
-EPISODES = {"begun": 0}
 MODULE_GENERATOR = np.random.default_rng(7)
 
 
@@ -61,48 +60,35 @@ def plain():
     return arm()
 
 
-class PushedInEachStep(Arm):
-    def before_step(self, action, physics):
-        physics.data.xfrc_applied[-1, 0] = 3 * np.sin(9 * physics.time())
-        super().before_step(action, physics)
+class WritesIntoTheSimulation(Arm):
+    """Forces and a mocap body, at the start, before and after each step."""
 
-
-class PushedFromTheStart(Arm):
     def start(self, physics):
         physics.data.qfrc_applied[:] = self.random.uniform(-1, 1, 2)
 
-
-class MovesItsHandBeforeAStep(Arm):
     def before_step(self, action, physics):
+        physics.data.xfrc_applied[-1, 0] = 3 * np.sin(9 * physics.time())
         physics.data.mocap_pos[0, 2] += 0.01
         super().before_step(action, physics)
 
-
-class MovesItsHandAfterAStep(Arm):
     def after_step(self, physics):
         physics.data.mocap_pos[0, 0] -= 0.02 + 0.1 * physics.data.qpos[0]
 
 
-class DampingDrifts(Arm):
+class DrawsItsModel(Arm):
+    """Dynamics and looks, of which one drifts from episode to episode and one changes in each step."""
+
     def start(self, physics):
-        physics.model.dof_damping[:] *= self.random.uniform(0.5, 2.0)
+        model, draw = physics.model, self.random.uniform
+        model.dof_damping[:] *= draw(0.5, 2.0)
+        model.opt.gravity[:] = [draw(-1, 1), 0, -5]
+        model.geom_size[1, 0] = draw(0.02, 0.1)
+        model.geom_rgba[0, :3] = draw(0, 1, 3)
+        model.mat_rgba[0, :3] = draw(0, 1, 3)
+        model.vis.headlight.ambient[:] = draw(0, 1)
 
-
-class DrawnLooks(Arm):
-    def start(self, physics):
-        physics.model.geom_size[1, 0] = self.random.uniform(0.02, 0.1)
-        physics.model.geom_rgba[0, :3] = self.random.uniform(0, 1, 3)
-        physics.model.mat_rgba[0, :3] = self.random.uniform(0, 1, 3)
-
-
-class ChangingLooks(Arm):
     def after_step(self, physics):
         physics.model.geom_rgba[0, 0] = physics.time() % 1
-
-
-class DrawnGravity(Arm):
-    def start(self, physics):
-        physics.model.opt.gravity[:] = [self.random.uniform(-1, 1), 0, -5]
 
 
 def own_step_and_reset():
@@ -117,11 +103,6 @@ def own_step_and_reset():
             return found._replace(reward=(found.reward or 0) + 10, observation={"seen": self.physics.data.qpos.copy()})
 
     return arm(kind=Environment)
-
-
-class CutOff(Arm):
-    def get_termination(self, physics):
-        return 1.0 if physics.time() > 0.1 + 0.1 * abs(physics.data.qpos[0]) else None
 
 
 class EndedByPython(Arm):
@@ -143,12 +124,9 @@ class ThreeActionsForTwoMotors(Arm):
         physics.set_control(np.array(action) @ TRIPLE)
 
 
-def strong():
-    return arm(xml=ARM.replace('"wrist" ctrlrange="-1 1"', '"wrist" ctrlrange="-0.1 5"'))
-
-
-def no_bounds():
-    return arm(xml=ARM.replace(' ctrlrange="-1 1"', ""))
+def odd_bounds():
+    one = ARM.replace('"hinge" ctrlrange="-1 1"', '"hinge"')
+    return arm(xml=one.replace('"wrist" ctrlrange="-1 1"', '"wrist" ctrlrange="-0.1 5"'))
 
 
 class TorquesAlone(Arm):
@@ -156,12 +134,12 @@ class TorquesAlone(Arm):
         return {"torque": physics.data.sensordata.copy()}
 
 
-def flat():
-    return arm(flat_observation=True)
+def flat_torques():
+    return arm(TorquesAlone(), flat_observation=True)
 
 
 def odd_limit():
-    return arm(time_limit=0.3)
+    return arm(time_limit=0.3, legacy_step=False)
 
 
 def sleeping():
@@ -171,10 +149,6 @@ def sleeping():
 def muscles():
     act = '<general name="first" joint="hinge" dyntype="filter" dynprm="0.1" gainprm="2" ctrlrange="-1 1"/>'
     return arm(xml=ARM.replace('<motor name="first" joint="hinge" ctrlrange="-1 1"/>', act))
-
-
-def current_step():
-    return arm(legacy_step=False)
 
 
 class Hills(Arm):
@@ -206,14 +180,10 @@ def keeps_physics():
 # -- what is drawn elsewhere, and seeded for each episode -------------------------------------------
 
 
-class NumpyAtTheStart(Arm):
+class DrawsElsewhereAtTheStart(Arm):
     def start(self, physics):
-        physics.data.qpos[:] = np.random.uniform(-1, 1, 2)
-
-
-class PythonAtTheStart(Arm):
-    def start(self, physics):
-        physics.data.qpos[:] = random.uniform(-1, 1)
+        physics.data.qpos[0] = np.random.uniform() + random.uniform(-1, 1)
+        physics.data.qpos[1] = np.random.default_rng().uniform()
 
 
 class GeneratorOfItsOwn(Arm):
@@ -226,11 +196,6 @@ class GeneratorOfItsOwn(Arm):
 
     def after_step(self, physics):
         physics.data.qvel[:] += self.generator.normal(size=2)
-
-
-class NewGeneratorAtTheStart(Arm):
-    def start(self, physics):
-        physics.data.qpos[:] = np.random.default_rng().uniform(-1, 1, 2)
 
 
 def drawn_model():
@@ -268,22 +233,6 @@ class FixedGenerator(Arm):
 class GeneratorOfTheModule(Arm):
     def start(self, physics):
         physics.data.qpos[:] = MODULE_GENERATOR.uniform(-1, 1, 2)
-
-
-def python_generator_without_seed():
-    generator = random.Random()
-
-    class Task(Arm):
-        def start(self, physics):
-            physics.data.qpos[:] = generator.uniform(-1, 1)
-
-    return arm(Task())
-
-
-class CountOfTheModule(Arm):
-    def start(self, physics):
-        EPISODES["begun"] += 1
-        physics.data.qvel[:] = EPISODES["begun"]
 
 
 def no_motor():
@@ -329,11 +278,6 @@ class PaintedAnew(Arm):
         physics.model.tex_data[:] = self.random.randint(256)
 
 
-class OtherHeadlight(Arm):
-    def start(self, physics):
-        physics.model.vis.headlight.ambient[:] = self.random.uniform(0, 1)
-
-
 def restarts_itself():
     class Environment(control.Environment):
         def step(self, action):
@@ -350,20 +294,14 @@ def fails():
     return 1 / 0
 
 
-class Quake(Hills):
-    def after_step(self, physics):
-        if physics.time() > 0.45:
-            physics.model.hfield_data[0] = 0.3
+def quake(after=0.45):
+    class Quake(Hills):
+        def after_step(self, physics):
+            if physics.time() > after:
+                physics.model.hfield_data[0] = physics.time()
 
-
-def quake():
     return hills(Quake)
 
 
-class EarlyQuake(Hills):
-    def after_step(self, physics):
-        physics.model.hfield_data[0] = physics.time()
-
-
 def early_quake():
-    return hills(EarlyQuake)
+    return quake(0.0)

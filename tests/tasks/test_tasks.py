@@ -194,14 +194,6 @@ def test_a_class_of_ones_own_steps_a_batch_by_itself(tmp_path, monkeypatch):
         get_task("__main__:task")
 
 
-@pytest.mark.parametrize("task_id, sizes", [("walker-walk", 24), ("cheetah-run", 17), ("humanoid-walk", 67)])
-def test_state_fields_cover_the_state_in_order(task_id, sizes):
-    task = get_task(task_id)
-    slices = list(task.state_slices.values())
-    assert task.state_size == sizes == slices[-1].stop
-    assert slices[0].start == 0 and all(a.stop == b.start for a, b in zip(slices, slices[1:], strict=False))
-
-
 @pytest.mark.parametrize("task_id", [*LOCOMOTION_TASKS, "reacher-hard"])
 def test_a_simulation_does_not_depend_on_its_neighbors_or_threads(task_id):
     task = get_task(task_id)
@@ -218,20 +210,23 @@ def test_a_simulation_does_not_depend_on_its_neighbors_or_threads(task_id):
     np.testing.assert_array_equal(run([0, 1, 2], 1), run([0, 1, 2], 2))
 
 
-@pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
+@pytest.mark.parametrize("task_id", [*LOCOMOTION_TASKS, "ant-maze-easy7x7a"])
 def test_a_stored_physics_state_continues_with_the_same_bits(task_id):
+    """Putting it back gives the stored state, but for what the step before left in the sensors of the ant."""
     task, rng = get_task(task_id), np.random.default_rng(1)
-    batch = task.batch(2)
+    batch, other = task.batch(2), task.batch(2)
     batch.reset([np.random.default_rng(5), np.random.default_rng(6)])
+    known = np.ones(task.state_size, bool)
+    for name in task.unstored_fields:
+        known[task.state_slices[name]] = False
+    assert known.sum() == {24: 24, 17: 17, 67: 67, 167: 154}[task.state_size]
     for _ in range(20):
-        batch.step(rng.uniform(-1, 1, (2, task.action_size)))
-    stored, action = batch.physics(), rng.uniform(-1, 1, (2, task.action_size))
-    expected = batch.step(action)
-    other = task.batch(2)
-    other.set_physics(stored)
-    found = other.step(action)
-    np.testing.assert_array_equal(found.state, expected.state)
-    np.testing.assert_array_equal(found.reward, expected.reward)
+        action = rng.uniform(-1, 1, (2, task.action_size))
+        other.set_physics(batch.physics())
+        expected, found = batch.step(action), other.step(action)
+        np.testing.assert_array_equal(found.state, expected.state)
+        np.testing.assert_array_equal(found.reward, expected.reward)
+        np.testing.assert_array_equal(other.set_physics(batch.physics())[:, known], expected.state[:, known])
 
 
 def test_humanoid_starts_without_touching_anything():
