@@ -164,10 +164,12 @@ def paint(
         images = {each: np.zeros(shape, np.uint8) for each in [name] * shown + [hidden_name] * hidden}
         for first in range(0, len(episode) * bool(images), PAINT_FRAMES):
             e, r = (index[first : first + PAINT_FRAMES] for index in (episode, row))
-            if shown and hidden:
-                painted = renderer.render_pair(physics[e, r], exogenous[e, r], [view])
-            else:
-                painted = (renderer.render(physics[e, r], exogenous[e, r], [view], hide_goal=hidden),)
+            states, labels = physics[e, r], exogenous[e, r]
+            painted = (
+                renderer.render_pair(states, labels, [view])
+                if shown and hidden
+                else (renderer.render(states, labels, [view], hide_goal=hidden),)
+            )
             for image, frames in zip(images.values(), painted, strict=True):
                 image[e, r] = frames[:, 0]
             progress(len(e))

@@ -44,11 +44,6 @@ def test_builtin_clips_are_24_frames_and_differ_between_splits():
     assert train.digest != val.digest
     first = {train.frames(v)[0].tobytes() for v in range(8)} | {val.frames(v)[0].tobytes() for v in range(8)}
     assert len(first) == 16
-    for backgrounds in (train, val):
-        for video in range(8):
-            frames = backgrounds.frames(video).astype(int)
-            assert frames.std() > 15  # busy
-            assert np.abs(frames[1:] - frames[:-1]).mean() > 0.5  # and moving
 
 
 STILLS = {f"{index}": 1 for index in range(5)}

@@ -153,7 +153,5 @@ main(sys.argv[1:], prog_name="dmcvb-gen")
         for done in [command(*asked) for asked in commands]:
             assert done.returncode == 0, done.stderr
         assert (tmp_path / task / "preview/preview.webp").exists()
-    drawn = ["evaluate-behaviour", "ant-maze-empty7x7", "--level", "random", "--episodes", "2", "--pictures", "paths"]
-    for asked, package in ((["train-behaviour", "walker-walk"], "torch"), (drawn, "matplotlib")):
-        refused = command(*asked)
-        assert refused.returncode == 2 and f"pip install {package}" in refused.stderr, refused.stderr
+    refused = command("train-behaviour", "walker-walk")
+    assert refused.returncode == 2 and "pip install torch" in refused.stderr, refused.stderr

@@ -14,7 +14,6 @@ from dmcvb_gen.storage.places import local_path
 URL = "s3://bucket/x"
 COMMANDS = {
     "train-behaviour": ["train-behaviour", "walker-walk", "--out", URL],
-    "evaluate-behaviour": ["evaluate-behaviour", "walker-walk", "--pictures", URL],
     "validate": ["validate", "RELEASE", "--out", URL],
     "preview": ["preview", "RELEASE", "--out", URL],
     "card": ["card", "RELEASE", "--out", URL],

@@ -32,6 +32,7 @@ LARGEST_DIFFERENCE = {MAZE: 2.5} | dict.fromkeys(SUITE, 1.5)
 
 CLOSE = [*CASES, *((task, "static") for task in LOCOMOTION_TASKS)]
 CLOSE += [(task, setting) for task in PAINTED for setting in ("none", "dynamic")]
+CLOSE += [(task, "dynamic_light0.5") for task in ("walker-walk", "humanoid-walk", "finger-spin")]  # finger's is a sun
 FAST = [("walker-walk", "none"), ("walker-walk", "static")]
 
 
@@ -59,16 +60,6 @@ def test_every_view_is_as_close_to_opengl_as_eyes_see(task_id, setting_name):
         assert 10 * np.log10(255**2 / np.mean(difference**2.0)) > 35, name
         worst = np.abs(difference).mean(axis=(1, 2, 3)).max()
         assert worst < 2 * LARGEST_DIFFERENCE[task_id], name  # no frame lacks a shadow or a mirror image
-
-
-@pytest.mark.slow
-@needs_opengl
-@pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "finger-spin"])
-def test_moved_lamps_are_as_close(task_id):
-    """Finger's lamp is directional, the others are spots."""
-    _, reference, ours = pair(task_id, "dynamic_light0.5")
-    assert np.abs(reference - ours).mean() < 1.5
-    assert np.abs(ours - pair(task_id, "none")[2]).mean() > 2
 
 
 @needs_opengl

@@ -160,7 +160,7 @@ def test_what_dm_control_does_is_what_is_stored(case):
     assert (together.state[0, 0] != together.state[1, 0]).any() or case in (h.flat_torques, h.own_step_and_reset)
 
 
-@named([*EQUAL, *SEEDED])
+@named([h.plain, h.DrawsItsModel, h.EndedByPython, h.CountsEpisodes, h.hills, h.keeps_physics, *SEEDED])
 def test_an_episode_depends_on_its_index_alone_and_can_be_replayed(case):
     task, other = task_of(case), task_of(case)
     task.most_at_once = 3

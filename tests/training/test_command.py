@@ -76,6 +76,11 @@ def evaluated(*arguments):
     return result.output
 
 
+@pytest.mark.slow
+def test_mazes_have_scores_of_their_own():
+    assert "rms m/s" in evaluated("ant-maze-easy7x7a", "walker-walk", "--level", "random", "--episodes", 2)
+
+
 @pytest.mark.full
 def test_one_command_sets_every_bundled_level_beside_the_paper():
     rows = json.loads(evaluated("--episodes", 2, "--json"))
