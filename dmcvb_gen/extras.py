@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 EXTRAS = {
-    "train": ("torch", "stable_baselines3", "sb3_contrib", "tensorboard"),
+    "train": ("torch", "stable_baselines3", "sb3_contrib"),
     "pictures": ("imageio_ffmpeg", "matplotlib"),
     "xarray": ("xarray",),
     "s3": ("s3fs",),

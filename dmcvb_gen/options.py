@@ -50,7 +50,6 @@ at_terminal = contextvars.ContextVar("at_terminal", default=False)
 """Whether a command runs, whose messages name flags; messages of functions name their parameters."""
 _FLAG = re.compile(r"`[^`]*`|dmcvb-gen [^;,(]*|--(?P<name>[a-z][a-z-]*)")
 _PARAMETERS = {
-    "agent": "agents",
     "all": "everything",
     "benchmark": "benchmarks",
     "distractor": "distractors",

@@ -1,4 +1,4 @@
-"""Code of your own: "<module>:<name>" names a task's, behaviour policy's or agent's function, or a distractor's class.
+"""Code of your own: "<module>:<name>" names a task's or behaviour policy's function, or a distractor's class.
 
 The code runs, so a name that was read from a file is refused: only names that a person gave to `allow` (the
 command line does, for what is typed there) or in an environment variable are run.
@@ -20,7 +20,6 @@ from dmcvb_gen.errors import DmcvbError
 TASKS = "DMCVB_GEN_TASKS"
 BEHAVIOURS = "DMCVB_GEN_BEHAVIOURS"
 DISTRACTORS = "DMCVB_GEN_DISTRACTORS"
-AGENTS = "DMCVB_GEN_AGENTS"
 """Environment variables with the names whose code may run, joined by commas; worker processes inherit them."""
 
 _OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -58,7 +57,7 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
     """Let the code of these names run in this process and its children; other names are left out.
 
     Args:
-      variable: `TASKS`, `BEHAVIOURS`, `DISTRACTORS` or `AGENTS`.
+      variable: `TASKS`, `BEHAVIOURS` or `DISTRACTORS`.
     """
     own = [name for name in names if is_own(name)]
     if own:
@@ -67,7 +66,7 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
 
 def permissions() -> dict[str, str]:
     """The environment variables that let code run here, for workers that do not inherit them."""
-    return {name: os.environ[name] for name in (TASKS, BEHAVIOURS, DISTRACTORS, AGENTS) if name in os.environ}
+    return {name: os.environ[name] for name in (TASKS, BEHAVIOURS, DISTRACTORS) if name in os.environ}
 
 
 def allowed(variable: str) -> list[str]:
@@ -80,7 +79,7 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
 
     Args:
       variable: the environment variable that lets it run.
-      kind: word for messages: "task", "behaviour", "distractor" or "agent".
+      kind: word for messages: "task", "behaviour" or "distractor".
 
     Raises:
       DmcvbError: its code may not run, or cannot be found.

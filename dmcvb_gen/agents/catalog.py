@@ -1,7 +1,6 @@
 """Find agents by name: "id+bc" is an encoder pre-trained by inverse dynamics with a policy by BC.
 
-    MODULE:NAME                          a user's own agent (`benchmarks.cell.OwnAgent`)
-    [PRETRAIN+]POLICY[:OPTION,...]
+    [PRETRAIN+]POLICY[:OPTION...]
 
 POLICY and PRETRAIN are names that `learners.register_agent` knows. With PRETRAIN the encoder is pre-trained and then
 frozen ("null": none, the policy trains its encoder); state-POLICY sees states instead of pictures. The options are
@@ -10,7 +9,6 @@ frames=N, of all agents that see pictures, and those of the two parts.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from dmcvb_gen.agents.data import FRAMES, Sizes
 from dmcvb_gen.agents.learners import PARTS, Learner, Policy, ReadyEncoder
 from dmcvb_gen.agents.networks import PAPER, Architecture, Encoder, observation_encoder, state_encoder
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.own_code import is_own, source_digest
+from dmcvb_gen.own_code import source_digest
 
 MOST = 64
 """The largest number that an option takes."""
@@ -42,18 +40,6 @@ def agent_names() -> tuple[str, ...]:
     return (*own, *(f"state-{name}" for name in own), *(f"{encoder}+{name}" for name in own for encoder in encoders()))
 
 
-def option_names() -> tuple[str, ...]:
-    """The names of all options that agents take."""
-    names = {"frames", *(name for part in PARTS.all().values() for name in part.options)}
-    return tuple(sorted(names))
-
-
-def split_agents(text: str) -> tuple[str, ...]:
-    """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between agents and between their options."""
-    separator = rf",(?!\s*(?:\w+=|(?:{'|'.join(option_names())})\b))"
-    return tuple(name.strip() for name in re.split(separator, text) if name.strip())
-
-
 @dataclass(frozen=True)
 class Agent:
     """An agent.
@@ -64,7 +50,6 @@ class Agent:
       sees_state: states instead of pictures.
       stack: frames an observation.
       options: (name, value) of the two parts' options that are not at their defaults, in the parts' order.
-      own: "module:name" of a user's agent, instead of all this.
     """
 
     policy: str
@@ -72,7 +57,6 @@ class Agent:
     sees_state: bool = False
     stack: int = FRAMES
     options: tuple[tuple[str, int | bool], ...] = ()
-    own: str | None = None
 
     @property
     def base(self) -> str:
@@ -83,16 +67,14 @@ class Agent:
 
     @property
     def name(self) -> str:
-        if self.own:
-            return self.own
         options = [f"frames={self.stack}"] if self.stack != FRAMES else []
         options += [name if value is True else f"{name}={value}" for name, value in self.options]
-        return self.base + (":" + ",".join(options) if options else "")
+        return ":".join([self.base, *options])
 
     @property
     def paper_name(self) -> str | None:
         """The column of the paper's table; None if it has none."""
-        if self.own or ":" in self.name or (self.sees_state and self.policy != "bc"):
+        if ":" in self.name or (self.sees_state and self.policy != "bc"):
             return None
         if self.sees_state:
             return "bc(state)"
@@ -115,7 +97,7 @@ class Agent:
 
     def foreign_code(self) -> dict[str, str]:
         """Part -> SHA-256 of its module's file, of parts from other packages: one that changed is trained again."""
-        parts = (part for part in (self.policy, self.pretrain) if part and not self.own)
+        parts = (part for part in (self.policy, self.pretrain) if part)
         modules = {part: PARTS.get(part).__module__ for part in parts}
         return {part: source_digest(module) for part, module in modules.items() if not module.startswith("dmcvb_gen.")}
 
@@ -127,8 +109,6 @@ def parse_agent(name: str) -> Agent:
       UnknownNameError, DmcvbError: no such agent or option, or one that this agent has no use for.
     """
     known = agent_names()
-    if is_own(name.strip()) and name.partition(":")[0].lower() not in known:
-        return Agent("bc", own=name.strip())
     base, _, options = name.strip().lower().partition(":")
     base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
     if base not in known:
@@ -142,7 +122,7 @@ def parse_agent(name: str) -> Agent:
 
 
 def _with_options(agent: Agent, text: str) -> Agent:
-    """An agent with the options "k=5,sample".
+    """An agent with the options "k=5:sample".
 
     Raises:
       DmcvbError: one is unknown, or of another agent.
@@ -152,7 +132,7 @@ def _with_options(agent: Agent, text: str) -> Agent:
     for part in parts:
         defaults |= PARTS.get(part).options
     values: dict[str, int | bool] = {}
-    for option in filter(None, text.split(",")):
+    for option in filter(None, text.split(":")):
         key, _, value = option.partition("=")
         kind = type(defaults.get(key))
         if kind is bool and not value:

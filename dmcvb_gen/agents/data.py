@@ -371,9 +371,9 @@ class TrainingData:
 
 
 def batches(
-    draw: Callable[[int, Batch | None], Batch], first: int, last: int, workers: int = 0, ahead: int = 4
+    draw: Callable[[int, Batch | None], Batch], steps: int, workers: int = 0, ahead: int = 4
 ) -> Iterator[tuple[int, Batch]]:
-    """(step, batch) for steps first .. last - 1, in order; drawn ahead by threads if there are workers.
+    """(step, batch) of each step, in order; drawn ahead by threads if there are workers.
 
     A batch is to be used before the next one is asked for: without workers its memory is used again.
 
@@ -382,15 +382,15 @@ def batches(
     """
     if not workers:
         batch = None
-        for step in range(first, last):
+        for step in range(steps):
             batch = draw(step, batch)
             yield step, batch
         return
     with ThreadPoolExecutor(workers) as pool:
-        waiting = {step: pool.submit(draw, step, None) for step in range(first, min(first + ahead, last))}
-        for step in range(first, last):
+        waiting = {step: pool.submit(draw, step, None) for step in range(min(ahead, steps))}
+        for step in range(steps):
             batch = waiting.pop(step).result()
-            if step + ahead < last:
+            if step + ahead < steps:
                 waiting[step + ahead] = pool.submit(draw, step + ahead, None)
             yield step, batch
 

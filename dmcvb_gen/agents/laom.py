@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 from dmcvb_gen.agents.data import Sizes
-from dmcvb_gen.agents.learners import Batch, Learner, adam, frozen_copy, move_towards, register_agent
+from dmcvb_gen.agents.learners import Batch, Learner, frozen_copy, move_towards, register_agent
 from dmcvb_gen.agents.networks import MLP, PAPER, Architecture, Encoder, observation_encoder
 
 
@@ -38,7 +38,6 @@ class LatentActionObservationModel(Learner):
         self.target = frozen_copy(self.see)
         self.f = MLP(2 * width, width, tanh=True)
         self.g = MLP(2 * width, width, tanh=True)
-        self.optimizers = {"main": adam([self])}
 
     def latent_action(self, batch: Batch) -> torch.Tensor:
         """z: (batch, latent) in (-1, 1), of one step."""

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 
 from dmcvb_gen.agents.data import Sizes
-from dmcvb_gen.agents.learners import Batch, Learner, adam, register_agent
+from dmcvb_gen.agents.learners import Batch, Learner, register_agent
 from dmcvb_gen.agents.networks import MLP, PAPER, Architecture, Encoder, ObservationDecoder, observation_encoder
 
 CODES, CODE_WIDTH = 64, 16
@@ -41,7 +41,6 @@ class LatentActionPolicy(Learner):
         self.see = observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
         self.f = MLP(2 * width, width, tanh=True)
         self.g = ObservationDecoder(sizes.channels // sizes.stack, sizes.picture, 2 * width, architecture)
-        self.optimizers = {"main": adam([self])}
         codes = (2 * torch.rand(CODES, CODE_WIDTH) - 1) * 5 / CODES
         self.register_buffer("codes", codes)
         self.register_buffer("sums", codes.clone())  # of the latent actions nearest to each code, averaged over time

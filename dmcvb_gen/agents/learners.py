@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import copy
+import functools
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -78,7 +79,8 @@ class Learner(nn.Module, abc.ABC):
     is registered is made as `cls(encoder, sizes, architecture, **options)`, a policy with `frozen=` besides.
 
     Attributes:
-      optimizers: by name; each holds the parameters that its loss moves and no others.
+      optimizers: by name; each holds the parameters that its loss moves and no others. By default one Adam, "main", of
+        all that can be trained, made when it is first asked for.
       half: compute losses in bfloat16 if autocast finds it safe; weights and optimizers stay float32.
       encoder: phi, if there is one.
     """
@@ -98,10 +100,11 @@ class Learner(nn.Module, abc.ABC):
     options: Mapping[str, int | bool] = {}
     """Its options in an agent's name and their defaults: True or False for a word, a number for word=1..64."""
 
-    def __init__(self):
-        super().__init__()
-        self.optimizers: dict[str, torch.optim.Optimizer] = {}
-        self.half = False
+    half = False
+
+    @functools.cached_property
+    def optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        return {"main": adam([self])}
 
     @abc.abstractmethod
     def losses(self, batch: Batch) -> dict[str, torch.Tensor]:

@@ -16,7 +16,6 @@ from dmcvb_gen.agents.learners import (
     Batch,
     Learner,
     Policy,
-    adam,
     frozen_copy,
     move_towards,
     register_agent,
@@ -44,7 +43,6 @@ class BehaviorCloning(Policy):
         super().__init__()
         self.encoder, self.frozen = encoder.requires_grad_(not frozen), frozen
         self.policy = MLP(encoder.features, sizes.action, tanh=True)
-        self.optimizers = {"main": adam([self])}
 
     def _phi(self, o: torch.Tensor) -> torch.Tensor:
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
@@ -77,7 +75,6 @@ class InverseDynamics(Learner):
         self.encoder, self.k_max, self.sample_k = encoder, k, sample
         self.embed_k = initialize(nn.Linear(1, LATENT)) if sample else None
         self.f = MLP(2 * encoder.features + sample * LATENT, sizes.action, tanh=True)
-        self.optimizers = {"main": adam([self])}
 
     def losses(self, batch):
         both = self.encoder(torch.cat([batch.observation, batch.next_observation]))  # (2 batch, latent)
@@ -99,7 +96,6 @@ class LatentForwardDynamics(Learner):
         self.target_encoder = frozen_copy(encoder)
         self.embed_action = MLP(sizes.action, LATENT, tanh=True)
         self.g = MLP(encoder.features + LATENT, encoder.features, tanh=True)
-        self.optimizers = {"main": adam([self])}
 
     def losses(self, batch):
         with torch.no_grad():
@@ -121,7 +117,6 @@ class Autoencoder(Learner):
         super().__init__()
         self.encoder = encoder
         self.psi = ObservationDecoder(sizes.channels, sizes.picture, encoder.features, architecture)
-        self.optimizers = {"main": adam([self])}
 
     def losses(self, batch):
         return {"loss": F.mse_loss(self.psi(self.encoder(batch.observation)).float(), batch.observation.float())}
@@ -134,7 +129,6 @@ class StatePrediction(Learner):
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
         super().__init__()
         self.encoder, self.h = encoder, initialize(nn.Linear(encoder.features, sizes.state))
-        self.optimizers = {"main": adam([self])}
 
     def losses(self, batch):
         return {"loss": F.mse_loss(self.h(self.encoder(batch.observation)).float(), batch.state)}
@@ -150,7 +144,6 @@ class ObservationProbe(Learner):
         super().__init__()
         self.encoder = encoder.requires_grad_(False)
         self.psi = ObservationDecoder(sizes.channels, sizes.picture, encoder.features, architecture)
-        self.optimizers = {"main": adam([self.psi])}
 
     def predict(self, batch: Batch) -> torch.Tensor:
         """(batch, channels, size, size): the observations as the decoder sees them."""
@@ -168,7 +161,6 @@ class StateProbe(Learner):
     def __init__(self, encoder: nn.Module, sizes: Sizes):
         super().__init__()
         self.encoder, self.h = encoder.requires_grad_(False), state_decoder(sizes.state, encoder.features)
-        self.optimizers = {"main": adam([self.h])}
 
     def predict(self, batch: Batch) -> torch.Tensor:
         """(batch, state): the normalized states as the decoder sees them."""

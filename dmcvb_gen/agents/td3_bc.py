@@ -14,13 +14,13 @@ from dmcvb_gen.agents.networks import LATENT, MLP, PAPER, Architecture, Convolut
 class _ActorCritic(nn.Module):
     """A body, an actor and two critics, each with a trunk between it and the body, or without (`trunk` None)."""
 
-    def __init__(self, body: nn.Module, features: int, action_size: int, trunk: int | None, bounded: bool):
+    def __init__(self, body: nn.Module, features: int, action_size: int, trunk: int | None):
         super().__init__()
         self.body, self.features = body, trunk or features
         self.actor_trunk = Trunk(features, trunk) if trunk else nn.Identity()
         self.critic_trunk = Trunk(features, trunk) if trunk else nn.Identity()
         self.actor = MLP(self.features, action_size, tanh=True)
-        self.critic1, self.critic2 = (MLP(self.features + action_size, 1, tanh=bounded) for _ in range(2))
+        self.critic1, self.critic2 = (MLP(self.features + action_size, 1, tanh=True) for _ in range(2))
 
     def act(self, body: torch.Tensor) -> torch.Tensor:
         return self.actor(self.actor_trunk(body)).float()
@@ -60,14 +60,12 @@ class TD3BC(Policy):
     Args:
       encoder: is read if it is frozen, without trunks of the heads' own; else actor and critics have convolutions
         (none on states) and trunks of their own.
-      unbounded: critics end without tanh, as in TD3-BC's own paper.
     """
 
     needs_next = True
     needs_pictures = False
     compiled = ("critic_loss", "actor_loss")
     only_learns = ("target.", "net.critic", "updates")
-    options = {"unbounded": False}
     gamma, noise, noise_clip, actor_every, decay = 0.99, 0.2, 0.5, 2, EMA_DECAY
 
     def __init__(
@@ -76,7 +74,6 @@ class TD3BC(Policy):
         sizes: Sizes,
         architecture: Architecture = PAPER,
         frozen: bool = False,
-        unbounded: bool = False,
         alpha: float = 2.5,
     ):
         super().__init__()
@@ -88,7 +85,7 @@ class TD3BC(Policy):
             features, trunk = body.features, architecture.latent
         else:
             body, features, trunk = nn.Identity(), sizes.state, LATENT
-        self.net = net = _ActorCritic(body, features, sizes.action, trunk, not unbounded)
+        self.net = net = _ActorCritic(body, features, sizes.action, trunk)
         self.target = frozen_copy(net)
         if frozen:
             self.target.body = body  # it never moves, so one will do

@@ -1,7 +1,6 @@
-"""Train any agent on its data and record its learning curve; a stopped training resumes.
+"""Train any agent on its data and record its learning curve.
 
-Every random number of step i (which transitions, shifts, TD3's noise) comes from (seed, i), so a run that is stopped
-and resumed draws what it would have drawn.
+Every random number of step i (which transitions, shifts, TD3's noise) comes from (seed, i).
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,19 +20,14 @@ from dmcvb_gen.agents.muon import Muon
 from dmcvb_gen.agents.networks import PAPER, Architecture
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import remove_partial, replacing
-from dmcvb_gen.state_file import pack_state, read_state_file
 
 HOLD_OUT_BATCHES, HOLD_OUT_TRANSITIONS = 4, 256
 """At least so many batches, and transitions, of the hold-out are what a test loss is the mean of; but no more batches
 than were trained on."""
 POINTS = 50
 """Points of the learning curve."""
-SAVE_SECONDS = 120.0
-"""Seconds of work that a stop may cost."""
 TICK_SECONDS = 0.2
 """Progress is told no more often: an Adam step on states takes less time than telling of it."""
-RESUME_FILE = "resume.safetensors"
 
 Curve = list[dict[str, Any]]
 """A point: step, seconds since the start, losses, hold-out losses ("test_..."), and what `evaluate` gave."""
@@ -162,7 +155,6 @@ def train(
     steps: int,
     *,
     shift: bool = True,
-    folder: Path | None = None,
     evaluate: Callable[[Learner], dict[str, Any]] | None = None,
     tick: Callable[[int], None] = lambda steps: None,
 ) -> Curve:
@@ -172,12 +164,11 @@ def train(
       data: with pictures, or states alone: the budget differs.
       steps: Adam steps.
       shift: pictures are shifted at random, as the paper's.
-      folder: folder of the state while it trains; a run with such a state resumes from it.
       evaluate: gives scores of the learner, added to the curve, at the end and so often as the budget says.
       tick: called with the number of steps since the last call.
 
     Raises:
-      DmcvbError: the folder holds the state of another learner, or a loss is no longer finite.
+      DmcvbError: a loss is no longer finite.
     """
     pixels = data.frames is not None
     size, learner.half = budget.state_batch_size, pixels and budget.precision == "bfloat16"
@@ -186,120 +177,48 @@ def train(
     if pixels and budget.muon:
         dtype = torch.bfloat16 if learner.half else torch.float32
         learner.optimizers = {name: Muon.instead_of(one, dtype) for name, one in learner.optimizers.items()}
-    first, curve, spent, means = 0, [], 0.0, _Means()
-    path = folder / RESUME_FILE if folder else None
-    if path is not None and path.exists():
-        first, curve, spent, means = _load_state(learner, path)
-        tick(first)
     if budget.compile:
         for name in learner.compiled:
             setattr(learner, name, compiled(getattr(learner, name)))
     evaluate_every, log_every = -(-steps // (budget.evaluations if evaluate else 1)), max(1, steps // POINTS)
-    started = saved = told_at = time.perf_counter()
-    told = first
+    curve, told = list[dict[str, Any]](), 0
+    seen: dict[str, list[torch.Tensor]] = {}
+    started = told_at = time.perf_counter()
 
     def make(step: int, reuse: Batch | None) -> Batch:
         return draw(learner, data, size, budget.seed, step, shift=shift, reuse=reuse)
 
-    schedule = _Schedule(learner, budget.rate if pixels else 1.0, steps if budget.decay else None)
+    groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
+    rates = [group["lr"] * (budget.rate if pixels else 1.0) for group in groups]
     workers = 2 if pixels and data.frames.mapped else int(data.device.type != "cpu")
-    for step, batch in batches(make, first, steps, workers):
+    for step, batch in batches(make, steps, workers):
         torch.manual_seed((budget.seed << 32) + step)
-        schedule.at(step)
-        means.add(learner.update(batch))
+        for group, rate in zip(groups, rates, strict=True):
+            group["lr"] = rate * (1 - step / steps) if budget.decay else rate
+        for name, value in learner.update(batch).items():
+            seen.setdefault(name, []).append(value)
         done = step + 1
         evaluating = done % evaluate_every == 0 or done == steps
         if evaluating or time.perf_counter() - told_at > TICK_SECONDS:
             tick(done - told)
             told, told_at = done, time.perf_counter()
         if evaluating or done % log_every == 0:
-            point = {"step": done, **means.take(done), **hold_out_losses(learner, data, size, steps)}
+            point = {"step": done, **_means(seen, done), **hold_out_losses(learner, data, size, steps)}
+            seen.clear()
             if evaluating and evaluate:
                 point |= evaluate(learner)
-            curve.append(point | {"seconds": round(spent + time.perf_counter() - started, 2)})
-        if path is not None and time.perf_counter() - saved > SAVE_SECONDS:  # the end too: its evaluation may be long
-            _save_state(learner, path, done, curve, spent + time.perf_counter() - started, means)
-            saved = time.perf_counter()
-    schedule.restore()
+            curve.append(point | {"seconds": round(time.perf_counter() - started, 2)})
     return curve
 
 
-class _Schedule:
-    """The learning rates of a learner's optimizers, step by step: `rate` times their own, falling to 0 after `end`."""
+def _means(seen: dict[str, list[torch.Tensor]], step: int) -> dict[str, float]:
+    """The means of losses, as numbers.
 
-    def __init__(self, learner: Learner, rate: float, end: int | None):
-        self._groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
-        self._own = [group["lr"] for group in self._groups]
-        self._rate, self._end = rate, end
-
-    def at(self, step: int) -> None:
-        factor = self._rate * (1 - step / self._end if self._end else 1.0)
-        for group, own in zip(self._groups, self._own, strict=True):
-            group["lr"] = own * factor
-
-    def restore(self) -> None:
-        for group, rate in zip(self._groups, self._own, strict=True):
-            group["lr"] = rate
-
-
-class _Means:
-    """Means of named losses since they were last taken."""
-
-    def __init__(self, sums: dict[str, torch.Tensor] | None = None, counts: dict[str, int] | None = None):
-        self._sums, self._counts = sums or {}, counts or {}
-
-    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, int]]:
-        """Return the state that it was made from, with what was added since."""
-        return dict(self._sums), dict(self._counts)
-
-    def add(self, losses: dict[str, torch.Tensor]) -> None:
-        for name, value in losses.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
-            self._counts[name] = self._counts.get(name, 0) + 1
-
-    def take(self, step: int) -> dict[str, float]:
-        """The means, as numbers.
-
-        Raises:
-          DmcvbError: one is no longer finite.
-        """
-        means = {name: float(value) / self._counts[name] for name, value in self._sums.items()}
-        for name, value in means.items():
-            if not np.isfinite(value):
-                raise DmcvbError(f"{name} is no longer finite at step {step}; look at the data with `dmcvb-gen verify`")
-        self._sums, self._counts = {}, {}
-        return means
-
-
-def _save_state(learner: Learner, path: Path, step: int, curve: Curve, seconds: float, means: _Means) -> None:
-    optimizers = {name: optimizer.state_dict()["state"] for name, optimizer in learner.optimizers.items()}
-    state = {"step": step, "seconds": seconds, "curve": curve, "means": means.state()}
-    content = pack_state(state | {"weights": learner.state_dict(), "optimizers": optimizers})
-    remove_partial(path.parent)  # of a process that was killed
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
-
-
-def _load_state(learner: Learner, path: Path) -> tuple[int, Curve, float, _Means]:
-    cure = "delete it to start that training again"
-    state = read_state_file(path, cure)
-    try:
-        learner.load_state_dict(state["weights"])
-        for name, optimizer in learner.optimizers.items():
-            optimizer.load_state_dict(optimizer.state_dict() | {"state": state["optimizers"][name]})
-            _lay_out(optimizer)
-        sums, counts = state["means"]
-        device = next(learner.parameters()).device
-        means = _Means({name: value.to(device) for name, value in sums.items()}, counts)
-        return state["step"], state["curve"], state["seconds"], means
-    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        reason = str(error).splitlines()[0]
-        raise DmcvbError(f"cannot resume from {path} ({reason}); {cure}") from None
-
-
-def _lay_out(optimizer: torch.optim.Optimizer) -> None:
-    """Put a loaded state into its parameters' order in memory: Adam's fused kernel walks both as they lie there."""
-    for parameter, state in optimizer.state.items():
-        for key, value in state.items():
-            if torch.is_tensor(value) and value.shape == parameter.shape:
-                state[key] = torch.empty_like(parameter, dtype=value.dtype, requires_grad=False).copy_(value)
+    Raises:
+      DmcvbError: one is no longer finite.
+    """
+    means = {name: float(sum(values)) / len(values) for name, values in seen.items()}
+    for name, value in means.items():
+        if not np.isfinite(value):
+            raise DmcvbError(f"{name} is no longer finite at step {step}; look at the data with `dmcvb-gen verify`")
+    return means

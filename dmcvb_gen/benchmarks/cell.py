@@ -16,14 +16,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import inspect
 import json
-import shutil
-import sys
-import time
 import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +30,12 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
-from dmcvb_gen.agents.data import Normalization, TrainingData, choose_episodes, default_memory, load_data
+from dmcvb_gen.agents.data import TrainingData, default_memory, load_data
 from dmcvb_gen.agents.learners import Learner, Policy
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.probe import action_probe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
-from dmcvb_gen.benchmarks.evaluate import Act, Evaluator, Score, TrainedAgent, protocol, renderer_choice
+from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, TrainedAgent, protocol, renderer_choice
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.manifest import canonical_json
@@ -48,118 +43,14 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
 from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
-from dmcvb_gen.loaders.sampler import StepSource
-from dmcvb_gen.own_code import AGENTS, find_function, source_digest
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, cores, ignore, open_pool
 from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.version import __version__
 
-RESULT_VERSION = 5
+RESULT_VERSION = 6
 INSPECTED = 150_000
 """Held-out transitions that an inspection's error is the mean of, at most (the paper's number)."""
-UNIT_EPISODES = 100
-
-
-# -- your own agents --------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class AgentData:
-    """Data that your own agent learns from.
-
-    Attributes:
-      sources: one a subset, all steps of its training episodes (`StepSource`: len(), [i] and gather(), numpy alone).
-      task, setting: scene of its policy's score. seed: seed of the validation.
-    """
-
-    sources: tuple[StepSource, ...]
-    task: str
-    setting: str
-    seed: int
-
-    @property
-    def source(self) -> StepSource:
-        """The first source; the only one, unless levels are mixed."""
-        return self.sources[0]
-
-
-@dataclass(frozen=True)
-class OwnAgent:
-    """An agent that a user brought, "module:name".
-
-    The name is that of a ready policy, or of a function or class whose first parameter is called `data` and whose
-    others have defaults: it gets the episodes that a cell learns from (`AgentData`) and makes a policy. A policy is a
-    callable as `dmcvb_gen.evaluate` takes it. Two attributes of the named object, if it has them, say what its policy
-    sees: `stack` (frames, 3) and `pixels` (True).
-    """
-
-    name: str
-    value: Any
-
-    @classmethod
-    def load(cls, name: str) -> OwnAgent:
-        """Import it; modules of the working folder are found.
-
-        Raises:
-          DmcvbError: the user did not ask for it (a result file named it), there is no such module or name, importing
-            it fails, or it cannot be called.
-        """
-        value = find_function(name, AGENTS, "agent")
-        if not callable(value):
-            raise DmcvbError(f"agent {name} is a {type(value).__name__}; expected a policy or a function of `data`")
-        agent = cls(name, value)
-        if isinstance(value, type) and not agent.learns:
-            raise DmcvbError(f"agent {name} is a class; expected a policy, or a function or class of `data`")
-        return agent
-
-    @property
-    def learns(self) -> bool:
-        """True if it makes a policy of data."""
-        try:
-            first, *others = inspect.signature(self.value).parameters.values()
-        except (TypeError, ValueError):
-            return False
-        optional = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-        return first.name == "data" and all(o.default is not o.empty or o.kind in optional for o in others)
-
-    @property
-    def stack(self) -> int:
-        return int(getattr(self.value, "stack", 3))
-
-    @property
-    def pixels(self) -> bool:
-        return bool(getattr(self.value, "pixels", True))
-
-    @property
-    def digests(self) -> dict[str, str]:
-        """Module files -> SHA-256, of the agent's own and of all that lie beside it: a changed agent is trained again.
-
-        Raises:
-          DmcvbError: the agent's file has changed since it was imported.
-        """
-        module = self.name.partition(":")[0]
-        found = {module: source_digest(module)}
-        file = getattr(sys.modules[module], "__file__", None)
-        for path in sorted(Path(file).parent.glob("*.py")) if file else ():
-            found.setdefault(path.name, hashlib.sha256(path.read_bytes()).hexdigest())
-        return found
-
-    def policy(self, data: AgentData) -> Act:
-        """The policy, trained if it learns.
-
-        Raises:
-          DmcvbError: training gives something that cannot be called.
-        """
-        policy = self.value(data) if self.learns else self.value
-        if not callable(policy):
-            raise DmcvbError(f"agent {self.name} returned a {type(policy).__name__}; expected a policy to call")
-        return policy
-
-
-def sees_pictures(agent: Agent) -> bool:
-    """Return True if an agent learns from pictures and is evaluated on them."""
-    return OwnAgent.load(agent.own).pixels if agent.own else not agent.sees_state
 
 
 # -- what decides a result --------------------------------------------------------------------------
@@ -198,7 +89,7 @@ def evaluation_of(release: Release, budget: Budget, cell: Cell) -> dict[str, Any
       BackgroundError: there are no `val` videos.
     """
     subset, pair = release[cell.policy[0].subset], cell.policy[0].goal_pair
-    shown = dict(pictures=sees_pictures(cell.agent), max_steps=budget.episode_steps)
+    shown = dict(pictures=not cell.agent.sees_state, max_steps=budget.episode_steps)
     return protocol(subset, goal_cells(subset, pair), budget.backgrounds, **shown)
 
 
@@ -209,18 +100,12 @@ def fingerprint(release: Release, budget: Budget, cell: Cell) -> str:
       DmcvbError: an encoder's weights or background videos are needed and not there.
     """
     agent = cell.agent
-    learns_pictures = not (agent.sees_state or agent.own)
     facts = {"version": RESULT_VERSION, "cell": cell.facts(), "budget": budget.facts()}
     facts |= {"data": data_digests(release, cell), "code": agent.foreign_code()}
-    if not learns_pictures:
+    if agent.sees_state:
         facts["budget"].pop("precision")
     if cell.benchmark != ENCODER:
         facts["evaluation"] = evaluation_of(release, budget, cell)
-        if budget.readout_steps and learns_pictures:  # `state_units` are of them
-            alike = [subset for subset in release.subsets.values() if subset.task == cell.task]
-            facts["units"] = sorted(data_digest(subset) for subset in alike)
-        if agent.own:
-            facts["own"] = OwnAgent.load(agent.own).digests
         if agent.ready_encoder:
             facts["weights"] = agent.ready_encoder.digest(budget.dino_weights)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -254,9 +139,7 @@ _held: dict[tuple, TrainingData] = {}
 
 
 def policy_steps(budget: Budget, agent: Agent) -> int:
-    """Adam steps of a cell's policy; those of a user's own agent are not known."""
-    if agent.own:
-        return 0
+    """Adam steps of a cell's policy."""
     return budget.state_steps if agent.sees_state else budget.pixel_steps
 
 
@@ -275,7 +158,6 @@ class CellRun:
         self.root, self.out, self.budget, self.cell, self.tick = str(root), Path(out), budget, cell, tick
         self.release = open_data(root, budget)
         self.mark = fingerprint(self.release, budget, cell)
-        self.own = OwnAgent.load(cell.agent.own) if cell.agent.own else None
 
     def path(self, suffix: str) -> Path:
         """A file of the cell, e.g. its ".json"."""
@@ -285,27 +167,18 @@ class CellRun:
     def result(self) -> dict[str, Any]:
         """Train and score it, unless its result is there.
 
-        A ready policy of the user's is scored each time: its score hangs on more than its code, and costs one
-        evaluation.
-
         Raises:
-          DmcvbError: the renderer cannot start, training does not stay finite, or an own policy gives no actions.
+          DmcvbError: the renderer cannot start, or training does not stay finite.
         """
         encoder = self.cell.benchmark == ENCODER
-        done = None if self.own and not self.own.learns else read_result(self.path(".json"), self.mark)
+        done = read_result(self.path(".json"), self.mark)
         if done and (not encoder or self.path(".safetensors").exists()):
             return done
-        made = self._pretrain() if encoder else self._score_own(self.own) if self.own else self._train()
+        made = self._pretrain() if encoder else self._train()
         facts = {"id": self.cell.id, "fingerprint": self.mark, "cell": self.cell.facts()}
         facts |= {"budget": self.budget.facts() | {"note": self.budget.note}, **made}
         write_json(self.path(".json"), facts)
-        shutil.rmtree(self._states, ignore_errors=True)
         return facts
-
-    @property
-    def _states(self) -> Path:
-        """Folder of the states of its trainings, from which a stopped one resumes."""
-        return self.path(f".{self.mark[:12]}.run")
 
     @property
     def _subset(self) -> Subset:
@@ -389,16 +262,9 @@ class CellRun:
             return self._fit(policy, data, steps, shift, f"{agent.name} on {self.cell.place}", evaluate=evaluate)
 
     def _fit(
-        self,
-        learner: Learner,
-        data: TrainingData,
-        steps: int,
-        shift: bool,
-        label: str,
-        folder: str = "",
-        evaluate: Any = None,
+        self, learner: Learner, data: TrainingData, steps: int, shift: bool, label: str, evaluate: Any = None
     ) -> Curve:
-        options = dict(shift=shift, folder=self._states / folder, evaluate=evaluate)
+        options = dict(shift=shift, evaluate=evaluate)
         return train(learner, data, self.budget, steps, tick=lambda made: self.tick(label, made), **options)
 
     def _encoded(self, encoder: nn.Module, data: TrainingData, draws: int) -> TrainingData:
@@ -411,22 +277,6 @@ class CellRun:
             return data
         dtype = torch.bfloat16 if self.budget.precision == "bfloat16" else torch.float32
         return data.encoded(encoder, dtype, lambda share: self.tick(f"encoding, {share:.0%}", 0))
-
-    def _score_own(self, own: OwnAgent) -> dict[str, Any]:
-        """Score a user's own agent: its policy is trained by the user's code, if at all."""
-        started, cell, budget = time.perf_counter(), self.cell, self.budget
-        data, views = self.data(pixels=False), "agents" if own.pixels else ()
-        sources = []
-        for part in cell.policy:
-            episodes, held = choose_episodes(self.release[part.subset], part, budget.seed)
-            sources.append(StepSource(self.release[part.subset], episodes[~held], views, own.stack))
-        policy = own.policy(AgentData(tuple(sources), cell.task, cell.setting, budget.seed))
-        trained = time.perf_counter() - started
-        with self._evaluator(own.pixels, own.stack) as evaluator:
-            score = evaluator.score(policy)
-        self._save_shots(score)
-        curve = [{"step": 0, "seconds": trained + score.seconds, "score": score.facts()}]
-        return self._facts(data, curve, 0.0) | {"pretraining": None, "inspection": None}
 
     # -- evaluation
 
@@ -490,51 +340,33 @@ class CellRun:
     def inspect(self, encoder: nn.Module, data: TrainingData) -> dict[str, Any]:
         """Measure what a frozen encoder still knows: test errors of decoders of its latents (section 5.1)."""
         budget, steps = self.budget, self.budget.readout_steps
-        torch.manual_seed(budget.seed)  # of the readouts' weights, also where training has just been resumed
+        torch.manual_seed(budget.seed)
         readouts = {
             "observation": ObservationProbe(encoder, data.sizes, budget.network),
             "state": StateProbe(encoder, data.sizes),
         }
-        draws = len(readouts) * steps * budget.batch_size + min(len(data.hold_out_rows), INSPECTED)
-        data, curves = self._encoded(encoder, data, draws), {}
+        draws = len(readouts) * (steps * budget.batch_size + min(len(data.hold_out_rows), INSPECTED))
+        data, found = self._encoded(encoder, data, draws), dict[str, Any](curves={})
         for name, learner in readouts.items():
             learner.to(budget.device)
-            curves[name] = self._fit(learner, data, steps, budget.frozen_shift, f"{name} decoder", folder=name)
-        errors, held_out = self.test_errors(readouts, data), len(data.hold_out_rows) > 0
-        batch = draw(readouts["observation"], data, 8, budget.seed, 0, hold_out=held_out)
+            found["curves"][name] = self._fit(learner, data, steps, budget.frozen_shift, f"{name} decoder")
+            self.tick("test errors of the decoders", 0)
+            found[f"{name}_mse"] = test_error(learner, data, budget.batch_size)
+        batch = draw(readouts["observation"], data, 8, budget.seed, 0, hold_out=len(data.hold_out_rows) > 0)
         with torch.no_grad(), readouts["observation"].precision():
             seen = readouts["observation"].predict(batch).float()
         newest = slice(-data.frames.channels, None)
         rows = [_to_pictures(pictures[:, newest][:, :3]) for pictures in (batch.observation, seen)]
         _save_sheet(self.path(".decoder.png"), rows)
-        return {**errors, "curves": curves, "held_out": held_out}
+        return found
 
-    @torch.no_grad()
-    def test_errors(self, readouts: dict[str, Any], data: TrainingData) -> dict[str, Any]:
-        """Errors of decoders on held-out transitions, at most 150,000 of them, evenly spread, each encoded once.
 
-        Returns:
-          "observation_mse" and "state_mse": mean squared errors. "state_l1": state field -> mean absolute error, in
-          the standard deviations of `state_units`. All None if nothing is held out.
-        """
-        rows = data.hold_out_rows
-        rows = rows[:: max(1, -(-len(rows) // INSPECTED))]
-        if not len(rows):
-            return {"observation_mse": None, "state_mse": None, "state_l1": None}
-        squared, absolute = dict.fromkeys(readouts, 0.0), torch.zeros(data.state.shape[1], device=data.device)
-        for few in rows.split(self.budget.batch_size):
-            self.tick("test errors of the decoders", 0)
-            batch = data.transitions(few)
-            with readouts["state"].precision():
-                if batch.latent is None:
-                    batch = dataclasses.replace(batch, latent=readouts["state"].encoder(batch.observation))
-                for name, learner in readouts.items():
-                    squared[name] += float(learner.losses(batch)["loss"]) * len(few)
-                absolute += (readouts["state"].predict(batch) - batch.state).abs().sum(dim=0)
-        scale = data.normalization.std.cpu() / state_units(self.release, self.cell.task)
-        each = absolute.cpu() * scale / len(rows)
-        fields = {name: float(each[part].mean()) for name, part in get_task(self.cell.task).state_slices.items()}
-        return {f"{name}_mse": total / len(rows) for name, total in squared.items()} | {"state_l1": fields}
+def test_error(learner: Learner, data: TrainingData, size: int) -> float | None:
+    """The loss on held-out transitions, at most 150,000 of them, evenly spread; None if nothing is held out."""
+    rows = data.hold_out_rows
+    rows = rows[:: max(1, -(-len(rows) // INSPECTED))]
+    losses = [float(learner.metrics(data.transitions(few))["loss"]) * len(few) for few in rows.split(size)]
+    return sum(losses) / len(rows) if len(rows) else None
 
 
 def _load_encoder(path: Path, encoder: nn.Module) -> None:
@@ -558,24 +390,6 @@ def data_score(subset: Subset, data: TrainingData) -> Score:
         reached = (data.discount[torch.as_tensor(ends - 1, device=data.device)] == 0).cpu().numpy()
         success, speed = float(reached.mean()), goal_speed(distance, data.lengths, reached, task)
     return Score.of(data.returns, success=success, speed=speed, limit=subset.record.max_steps)
-
-
-def state_units(release: Release, task: str) -> torch.Tensor:
-    """(state,) standard deviations of a task's states over all levels of the release, floored at 1e-3.
-
-    One normalization for all levels, so that errors of agents that learned from different levels compare. A level
-    counts by up to 100 episodes of its first setting, as the settings of a level often share their trajectories.
-    """
-    first: dict[str, Subset] = {}
-    for subset in release.subsets.values():
-        if subset.task == task:
-            first.setdefault(subset.level, subset)
-    parts = []
-    for subset in first.values():
-        few, lengths = subset.episodes[:UNIT_EPISODES], subset.lengths[:UNIT_EPISODES]
-        states = subset.read("state", few)
-        parts += [values[: length + 1] for values, length in zip(states, lengths, strict=True)]
-    return Normalization.of(torch.from_numpy(np.concatenate(parts)).float()).std
 
 
 def _thin(point: dict[str, Any]) -> dict[str, Any]:
@@ -668,7 +482,7 @@ def try_cell(
 def planned_steps(budget: Budget, cells: Sequence[Cell]) -> int:
     """Adam steps of cells, their encoders and decoders."""
     encoders = {cell.encoder for cell in cells} - {None}
-    decoders = sum(2 * budget.readout_steps for cell in cells if not (cell.agent.sees_state or cell.agent.own))
+    decoders = sum(2 * budget.readout_steps for cell in cells if not cell.agent.sees_state)
     policies = sum(policy_steps(budget, cell.agent) for cell in cells)
     return policies + decoders + len(encoders) * budget.pixel_steps
 

@@ -1,8 +1,7 @@
 """Check the structure of a release before any training, and what scores do not say after it.
 
 `release.verify` looks at bytes, shapes, values, physics and sampled pixels; here it is asked first, and what only a
-benchmark cares about comes on top: returns as the policies and the paper promise, labels that fit their setting,
-pictures that show something.
+benchmark cares about comes on top: returns as the policies and the paper promise, pictures that show something.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.inputs import background_source, video_source
 from dmcvb_gen.generate.paint import render_differences
 from dmcvb_gen.loaders.painted import PaintedSubset
-from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order, open_pool
+from dmcvb_gen.parallel import ProgressCallback, Workers, ignore, in_order, open_pool
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.release.verify import verify_folder
-from dmcvb_gen.spec import CUE, DISTRACTOR_KINDS, FIXED, DistractorSetting
+from dmcvb_gen.spec import FIXED
 from dmcvb_gen.tasks import get_task
 
 STANDARD_ERRORS = 4.0
@@ -116,52 +115,6 @@ def check_paper_returns(subset: Subset) -> Iterator[Issue]:
         yield Issue("paper", subset.name, f"mean return is {mean:.1f}, the paper's is {paper['mean']:.1f}")
 
 
-def check_labels(subset: Subset) -> Iterator[Issue]:
-    """The distractors' labels are what the setting's name says; imported data have none."""
-    if subset.record.imported:
-        return
-    task, setting = get_task(subset.task), subset.record.distractor
-    looks = [look for split in ("train", "val") for style in task.styles(split) for look in task.looks(style)] or [-1]
-    own = task.material_colors.astype(np.float32)
-    names = [f"exogenous/{name}" for name in ("background_video", "background_frame", "material_rgb", "style")]
-    for episode, labels in subset.each_episode(names):
-        video, frame, color, style = labels.values()
-        problems = [(~np.isin(style, looks) | (style != style[0]), "the maze's style is not one of its split's")]
-        problems += _label_problems(setting, own, video, frame, color)
-        for bad, message in problems:
-            if bad.any():
-                yield Issue("labels", subset.name, message, episode, int(bad.argmax()))
-    if (setting.kind == "none") != (subset.record.backgrounds is None):
-        yield Issue("labels", subset.name, f"the manifest's backgrounds do not fit the setting {subset.setting!r}")
-
-
-def _label_problems(
-    setting: DistractorSetting, own: np.ndarray, video: np.ndarray, frame: np.ndarray, color: np.ndarray
-):
-    """((step,) bool where it is wrong, what is) of one episode of a setting.
-
-    Args:
-      own: (material, 3), the model's colors.
-      video, frame: (step,). color: (step, material, 3).
-    """
-    if setting.kind not in DISTRACTOR_KINDS:
-        return []  # what a user's own kind draws is its author's to say
-    problems: list[tuple[np.ndarray, str]] = []
-    if not (setting.varies("color") or setting.varies(CUE)):
-        changed = np.abs(color - own).max(axis=(1, 2)) > 1e-6
-        problems += [(changed, "a material has another color, the setting has none")]
-    if not setting.varies("background"):
-        return [*problems, ((video != -1) | (frame != -1), "a background is named, the setting has none")]
-    problems += [((video < 0) | (video != video[0]), "the background is not one video throughout")]
-    if setting.kind == "static":
-        return problems + [
-            (frame != frame[0], "the background moves in a static setting"),
-            ((color != color[0]).any(axis=(1, 2)), "colors change in a static setting"),
-        ]
-    jumps = np.abs(np.diff(frame.astype(int), prepend=frame[:1])) > 1
-    return problems + [(jumps, "the background skips frames")]
-
-
 def check_pictures(subset: Subset) -> tuple[list[Issue], list[Issue]]:
     """(findings, warnings): frames that are black or of one color; episodes that show the same frame throughout.
 
@@ -201,19 +154,6 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
     return render_differences(release, painted, sources)
 
 
-class _Longer:
-    """A tick whose expected total is higher than its callee announces, because more work follows."""
-
-    def __init__(self, tick: ProgressCallback, more: int):
-        self._tick, self._more = tick, more
-
-    def __call__(self, done: Any) -> None:
-        self._tick(done)
-
-    def expect(self, count: float) -> None:
-        expect(self._tick, count + self._more)
-
-
 def check_structure(
     release: Release,
     backgrounds: str | None = None,
@@ -224,8 +164,7 @@ def check_structure(
 
     Args:
       backgrounds: present place of the manifest's videos, if they moved.
-      tick: told the subset that is looked at: for the bytes of each few shards, for values, for labels; it is told
-        beforehand how often.
+      tick: told what `verify` looks at, and beforehand how often.
       workers: processes, or a Ray cluster that sees the folder; a subset each.
 
     Raises:
@@ -235,7 +174,6 @@ def check_structure(
     all_records = Release.open(release.path).manifest.subsets
     ours = {name for record in release.manifest.subsets for name in (record.name, *record.layers)}
     not_ours = {name for record in all_records for name in (record.name, *record.layers)} - ours
-    tick = _Longer(tick, 2 * len(release.subsets) - len(all_records))  # labels follow; of others bytes alone count
     with open_pool(workers, tick=tick) as pool:
         verified = verify_folder(release.path, backgrounds, tick, pool, names=release.subsets)
         findings, warnings = [f for f in verified.findings if f.subset not in not_ours], [*verified.unchecked]
@@ -252,9 +190,8 @@ def check_structure(
 
 def _check_subset(subset: Subset, tick: ProgressCallback) -> tuple[list[Issue], list[Issue]]:
     """Return what is wrong with a subset, and what is odd about it."""
-    tick(subset.name)
     found, odd = check_pictures(subset)
-    return [*check_policy_returns(subset), *check_labels(subset), *found], [*odd, *check_paper_returns(subset)]
+    return [*check_policy_returns(subset), *found], [*odd, *check_paper_returns(subset)]
 
 
 # -- what scores do not say -------------------------------------------------------------------------

@@ -25,16 +25,17 @@ from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.manifest import MAX_STEPS
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.recipe import NATIVE
 from dmcvb_gen.generate.references import normalized, reference_returns
+from dmcvb_gen.options import Count, Seed, Split, checked
 from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.spec import LEVELS, SPLITS, GoalMode, SubsetSpec, parse_setting
+from dmcvb_gen.spec import LEVELS, GoalMode, SubsetSpec, parse_setting
 from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ STREAM_NAME = "validate"
 """Name of the evaluation's random streams, from which no release is made."""
 ROUNDING = 1e-5
 """How far an action may leave its bounds before it is refused: what rounding does."""
-SPLIT = "val"
+SPLIT: Split = "val"
 """Split of the videos and maze styles that no data show."""
 
 
@@ -347,22 +348,23 @@ def check_actions(
     return values.clip(low, high)
 
 
+@checked
 def evaluate(
-    policy: Act,
-    where: str | Subset,
+    policy: Any,
+    where: Any,
     *,
-    episodes: int = 30,
-    seed: int = 0,
-    stack: int | None = None,
+    episodes: Count = 30,
+    seed: Seed = 0,
+    stack: Count | None = None,
     pixels: bool | None = None,
     size: int | None = None,
     renderer: str | None = None,
     samples: int | None = None,
     backgrounds: str = "builtin",
-    split: str = SPLIT,
+    split: Split = SPLIT,
     action_repeat: Literal[1, 2, 4] | None = None,
-    max_steps: int | None = None,
-    threads: int = 1,
+    max_steps: Count | None = None,
+    threads: Count = 1,
 ) -> Score:
     """Score a policy of your own by the protocol, starts and videos of `validate`.
 
@@ -397,14 +399,6 @@ def evaluate(
     """
     stack = _own_value(policy, "stack", stack, 3)
     pixels = _own_value(policy, "pixels", pixels, True)
-    counts = {"episodes": episodes, "stack": stack, "threads": threads}
-    counts |= {} if max_steps is None else {"max_steps": max_steps}
-    for name, number in (counts | {"seed": seed}).items():
-        least = int(name in counts)
-        if not isinstance(number, int | np.integer) or number < least:
-            raise DmcvbError(f"{name} is {number}; give a whole number, at least {least}")
-    if split not in SPLITS:
-        raise UnknownNameError("split", split, SPLITS)
     seen = getattr(policy, "evaluation", {}) or {}
     drawn = seen.get("renderer") or {"name": NATIVE, "samples": None}
     if renderer in (None, drawn["name"]):

@@ -12,7 +12,6 @@ import csv
 import functools
 import itertools
 import re
-import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -26,7 +25,6 @@ from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.own_code import AGENTS, allow
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task
 from dmcvb_gen.registry import Registry
 from dmcvb_gen.spec import (
@@ -41,14 +39,7 @@ from dmcvb_gen.spec import (
     subset_name,
     task_folder,
 )
-from dmcvb_gen.tasks import ACTION_REPEAT, get_task
-
-FIXED_GOALS = 5
-"""Fixed (start, goal) pairs a layout, as the paper made them."""
-DEFAULT_EPISODES = 100
-"""Episodes that a command asks for if the release has none to go by."""
-DEFAULT_SIZE = 64
-"""Pixels a side if a rollout is not told another size."""
+from dmcvb_gen.tasks import get_task
 
 SHORT = dict(
     readout_steps=500,
@@ -206,12 +197,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class Missing:
-    """Subsets that a benchmark needs of a task and does not find, and the command that makes them."""
+    """Subsets that a benchmark needs of a task and does not find."""
 
     benchmark: str
     task: str
     subsets: tuple[str, ...]
-    command: str
 
 
 def only(release: Release, patterns: Sequence[str]) -> Release:
@@ -233,7 +223,6 @@ class SubsetFinder:
     def __init__(self, release: Release):
         self.release = release
         self._names = {(s.task, s.level, s.setting): name for name, s in release.subsets.items()}
-        self._records = {name: subset.record for name, subset in release.subsets.items()}
         self.tasks = tuple(dict.fromkeys(subset.task for subset in release.subsets.values()))
         self._asked: dict[str, list[tuple[str, str]]] = {}
 
@@ -267,41 +256,9 @@ class SubsetFinder:
     def missing(self, benchmark: str) -> list[Missing]:
         """Requests that nothing in the release fits, by task."""
         return [
-            Missing(
-                benchmark,
-                task,
-                tuple(dict.fromkeys(subset_name(task, level, setting) for level, setting in asked)),
-                self._command(benchmark, task, asked),
-            )
+            Missing(benchmark, task, tuple(dict.fromkeys(subset_name(task, *place) for place in asked)))
             for task, asked in self._asked.items()
         ]
-
-    def _command(self, benchmark: str, task: str, lacking: list[tuple[str, str]]) -> str:
-        """Return the command that rolls out a task with what is missing and what the release has of it."""
-        have = [(level, setting) for t, level, setting in self._names if t == task]
-        levels = dict.fromkeys(level for level, _ in have + lacking)
-        settings = dict.fromkeys(setting for _, setting in have + lacking)
-        counts = [self._records[self._names[task, *place]].episodes for place in have if place[1] != FIXED]
-        count = max(counts, default=DEFAULT_EPISODES)
-        shape = self._shape(task)
-        rollout = f"dmcvb-gen rollout {shlex.quote(task)} " + " ".join(f"--level {level}" for level in levels)
-        out = f"--out releases/{slug(benchmark)}"
-        if not is_maze(task):
-            return f"{rollout}{''.join(f' --distractor {s}' for s in settings)} --episodes {count}{shape} {out}"
-        goals = [setting for setting in settings if setting != FIXED]
-        asked = [f"--goal {setting}" for setting in goals] + [f"--episodes {count}"] * bool(goals)
-        asked += [f"--goal {FIXED}{FIXED_GOALS}"] * (FIXED in settings)
-        return f"{rollout} {' '.join(asked)}{shape} {out}"
-
-    def _shape(self, task: str) -> str:
-        """Options that give new subsets the images' size and the time limit of what there is of a task."""
-        shapes = {(r.size, r.max_steps, r.action_repeat) for r in self._records.values() if r.task == task}
-        if len(shapes) != 1:
-            return ""
-        size, limit, repeat = shapes.pop()
-        options = f" --size {size}" if size != DEFAULT_SIZE else ""
-        options += f" --action-repeat {repeat}" if repeat != ACTION_REPEAT else ""
-        return options + (f" --max-steps {limit}" if limit != get_task(task).at(repeat).max_steps else "")
 
 
 # -- fixed goals of a maze --------------------------------------------------------------------------
@@ -442,7 +399,6 @@ def plan_benchmark(name: str, release: Release, agents: Sequence[str] = ()) -> t
       DmcvbError: no such benchmark or agent.
     """
     benchmark, data = BENCHMARKS.get(name), SubsetFinder(release)
-    allow(agents, AGENTS)
     chosen = [parse_agent(agent) for agent in agents or benchmark.agents]
     if benchmark.compares_encoders:
         chosen = [agent for agent in chosen if agent.pretrain]
@@ -551,7 +507,7 @@ class Ablations(Benchmark):
 
     title = "Ablations"
     # Inverse dynamics over more steps stand beside pre-training by BC, which the paper sees them tend to.
-    agents = ("bc:frames=1", "bc", "bc+bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10,sample")
+    agents = ("bc:frames=1", "bc", "bc+bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10:sample")
     shares = (0.01, 0.05, 0.1, 0.25, 0.5)
 
     def cells(self, data, agents):

@@ -15,42 +15,29 @@ import json
 import math
 import re
 import tempfile
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.trainer import Budget
-from dmcvb_gen.benchmarks.cell import OwnAgent, kept_results, open_data, planned_steps, run_cells
-from dmcvb_gen.benchmarks.checks import (
-    Results,
-    Structure,
-    check_structure,
-    comparable,
-    known_returns,
-    training_warnings,
-)
-from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, get_budget, only, paper_score, plan_benchmark
+from dmcvb_gen.benchmarks.checks import Results, Structure, comparable, known_returns
+from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, only, paper_score, plan_benchmark
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import return_statistics
-from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
-from dmcvb_gen.parallel.cores import usable_cores
 from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.precision import choose_precision
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.spec import is_maze, matches, task_folder
+from dmcvb_gen.spec import is_maze, task_folder
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import pluralize
@@ -69,7 +56,6 @@ CHECKS = {
     "physics": "stored actions lead to the stored physics states",
     "pixels": "sampled frames render to the stored ones",
     "pictures": "no black or one-colored images",
-    "labels": "distractor labels fit their setting",
     "modalities": "depth, segmentation and the like, if stored, are what the states show",
 }
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""
@@ -123,110 +109,6 @@ class Validation:
         return self.episodes[0] == self.episodes[1]
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Callbacks that follow a validation.
-
-    Attributes:
-      checking: a tick, told the subset that is checked.
-      total: called with the number of Adam steps to come.
-      training: called with what is trained and the steps made.
-      done: called with each cell and its result.
-    """
-
-    checking: ProgressCallback = ignore
-    total: Callable[[int], None] = field(default=lambda steps: None)
-    training: Callable[[str, int], None] = field(default=lambda what, steps: None)
-    done: Callable[[Cell, dict[str, Any]], None] = field(default=lambda cell, result: None)
-
-
-def make_budget(
-    profile: str = "smoke",
-    *,
-    scale: float = 1.0,
-    workers: Workers = 1,
-    threads: int | None = None,
-    device: str = "cpu",
-    precision: str = "auto",
-    memory: float | None = None,
-    **fields: Any,
-) -> Budget:
-    """Make the budget of a validation from a user's arguments.
-
-    Args:
-      profile: "smoke", "brief", "quick" or "paper". scale: factor of its steps.
-      workers: number of workers that share the cores; each gets as many threads as are left, on a cluster one.
-      precision: "auto" takes bfloat16 if the device has instructions for it.
-      memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
-      fields: others of `Budget`.
-
-    Raises:
-      DmcvbError: an unknown profile, or a device that is not here.
-    """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
-    return replace(
-        get_budget(profile).scaled(scale),
-        device=device,
-        precision=choose_precision(precision, device),
-        threads=threads or (max(1, usable_cores() // workers) if isinstance(workers, int) else 1),
-        memory=None if memory is None else int(memory * 1e9),
-        **{name: str(value) if isinstance(value, Path) else value for name, value in fields.items()},
-    )
-
-
-def validate(
-    path: str | Path,
-    out: str | Path,
-    budget: Budget,
-    *,
-    benchmarks: Sequence[str] = ("b1",),
-    agents: Sequence[str] = (),
-    patterns: Sequence[str] = (),
-    workers: Workers = 1,
-    train_unsound: bool = False,
-    progress: Progress | None = None,
-) -> Validation:
-    """Check a release, run benchmarks on it and write the report.
-
-    Args:
-      path: the release's folder. out: the report's.
-      benchmarks: names of registered benchmarks; none: structure checks alone.
-      agents: instead of each benchmark's own.
-      patterns: only these subsets.
-      workers: subsets checked and cells trained side by side, or a Ray cluster that sees the same folders.
-      train_unsound: run the benchmarks even if a structure check fails.
-
-    Raises:
-      DmcvbError: there is no release, or a name is unknown, or the release has no data for a benchmark asked for, or
-        the report's folder cannot be written, or holds results of another release or budget.
-    """
-    started, progress = time.perf_counter(), progress or Progress()
-    release = open_data(path, budget)
-    chosen, cells, missing = plan_validation(release, benchmarks, agents, patterns)
-    if patterns:  # a subset that was not asked for is not missing
-        missing = [one for one in missing if any(matches(name, patterns) for name in one.subsets)]
-    claim_folder(out, release, budget, training=bool(cells))
-    structure = check_structure(chosen, budget.backgrounds, progress.checking, workers)
-    results: list[tuple[Cell, dict[str, Any]]] = []
-    if structure.sound or train_unsound:
-        progress.total(planned_steps(budget, cells))
-        for cell, result in run_cells(path, out, budget, cells, workers, progress.training):
-            progress.done(cell, result)
-            results.append((cell, result))
-        results.sort(key=lambda pair: cells.index(pair[0]))
-    known = {cell for cell, _ in results}
-    shown = [*results, *((cell, result) for cell, result in kept_results(release, out, budget) if cell not in known)]
-    warnings = (*structure.warnings, *training_warnings(release, budget, shown))
-    planned = dict.fromkeys([*cells, *(cell for cell, _ in shown)])
-    facts = report_facts(chosen, budget, structure, len(planned), shown, missing, warnings)
-    facts |= {"seconds": time.perf_counter() - started}
-    page = write_report(Path(out), facts, shown)
-    there, asked = (facts["episodes"][name] for name in ("there", "asked"))
-    json_file = page.with_suffix(".json")
-    return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), page, json_file)
-
-
 def plan_validation(
     release: Release, benchmarks: Sequence[str], agents: Sequence[str], patterns: Sequence[str]
 ) -> tuple[Release, list[Cell], list[Missing]]:
@@ -243,21 +125,17 @@ def plan_validation(
     for name in dict.fromkeys(benchmarks):
         found, lacking = plan_benchmark(name, chosen, agents)
         if not found:
-            needs = [f"roll out {', '.join(m.subsets[:4])}: {m.command}" for m in lacking] or ["roll out another task"]
+            needs = [f"roll out {', '.join(m.subsets[:4])}" for m in lacking] or ["roll out another task"]
             cure = "let --only take more subsets" if patterns else "; ".join(needs)
             raise DmcvbError(f"benchmark {name} has no data in {chosen.place}; {cure}")
         cells += found
         missing += lacking
     used = {cell.agent for cell in cells}
-    for agent in used:
-        if agent.own:
-            OwnAgent.load(agent.own)  # a wrong name is told before any work
     idle = [name for name in agents if (agent := parse_agent(name)).pretrain is None and agent not in used]
     if benchmarks and idle:
         raise DmcvbError(
             f"{' and '.join(benchmarks)}: agents with a pre-trained encoder are compared with bc, and "
-            f"{' and '.join(idle)} {'has' if len(idle) == 1 else 'have'} none; remove "
-            f"{'it' if len(idle) == 1 else 'them'}, or add --benchmark b1"
+            f"{idle[0]} has none; remove it, or add --benchmark b1"
         )
     return chosen, cells, missing
 
@@ -473,7 +351,7 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
         groups=_groups(facts),
         comparison=_comparison(facts["comparison"]),
         notes=_notes(facts),
-        missing=[(m["benchmark"], ", ".join(m["subsets"]), m["command"]) for m in facts["missing"]],
+        missing=[(m["benchmark"], ", ".join(m["subsets"])) for m in facts["missing"]],
     )
 
 
@@ -645,10 +523,8 @@ def _inspection(good: Results) -> list[tuple[str, ...]]:
     rows = []
     for cell, result in good:
         found = result["inspection"]
-        if found and found["state_l1"]:
-            fields = ", ".join(f"{name} {error:.3f}" for name, error in found["state_l1"].items())
-            errors = [f"{found[key]:.4f}" for key in ("observation_mse", "state_mse")]
-            rows.append((cell.label, cell.place, *errors, fields))
+        if found and found["state_mse"] is not None:
+            rows.append((cell.label, cell.place, *(f"{found[key]:.4f}" for key in ("observation_mse", "state_mse"))))
     return rows
 
 

@@ -1,26 +1,30 @@
-"""The public door to a validation: what a person asks for becomes a budget and a run of `report`."""
+"""Validate a release: what a person asks for becomes a budget and cells; checks, trainings and the report follow."""
 
+import dataclasses
 import inspect
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Lt
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Count, Local, Location, Names, Precision, checked, progress_bar, refuse
 from dmcvb_gen.parallel import Workers, ignore
+from dmcvb_gen.spec import matches
 from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
+    from dmcvb_gen.agents.trainer import Budget
     from dmcvb_gen.benchmarks.report import Validation
 
 TRAINING = (
-    *("agents", "profile", "scale", "seed", "train_unsound"),
+    *("benchmarks", "agents", "profile", "scale", "seed", "train_unsound"),
     *("threads", "device", "precision", "compile", "dino_weights"),
 )
-"""Options of `validate`, beside the benchmarks, that say what is trained, and how."""
+"""Options of `validate` that say what is trained, and how."""
 
 
 @checked
@@ -30,7 +34,7 @@ def validate(
     profile: str = "smoke",
     scale: Annotated[float, Gt(0), Lt(math.inf)] = 1.0,
     benchmarks: Names = ("b1",),
-    agents: Names = (),
+    agents: Names | None = None,
     only: Names = (),
     out: Local | None = None,
     checks_only: bool = False,
@@ -72,43 +76,111 @@ def validate(
     `on_score` is called with the budget, a cell and its result, as soon as it is known.
 
     Raises:
-      DmcvbError: there is no release, a name is unknown, or the release has no data for a benchmark.
+      DmcvbError: there is no release, a name is unknown, the release has no data for a benchmark, this torch finds no
+        CUDA device, or the report's folder cannot be written or holds results of another release or budget.
     """
-    given = locals()
-    from dmcvb_gen.agents.catalog import parse_agent, split_agents
-    from dmcvb_gen.benchmarks import report
-    from dmcvb_gen.benchmarks.cell import default_workers
+    asked = {name: value for name, value in locals().items() if name in TRAINING}
+    from dmcvb_gen.benchmarks.cell import default_workers, kept_results, open_data, planned_steps, run_cells
+    from dmcvb_gen.benchmarks.checks import check_structure, training_warnings
+    from dmcvb_gen.benchmarks.report import Validation, claim_folder, plan_validation, report_facts, write_report
 
+    started = time.perf_counter()
     if checks_only:
-        usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
-        changed = {name: given[name] != usual[name] for name in TRAINING}
-        refuse("--checks-only trains nothing", benchmark=benchmarks != usual["benchmarks"], **changed)
-    names = [name for text in as_names(agents) for name in split_agents(text)]
+        _refuse_training(**asked)
+    names = agent_names(agents, dino_weights)
+    workers = workers or default_workers(device)
+    budget = make_budget(
+        *(profile, scale, workers, threads, device, precision, memory),
+        compile=compile,
+        seed=seed,
+        dino_weights=dino_weights,
+        backgrounds=backgrounds,
+    )
+    data, patterns = open_data(release, budget), as_names(only)
+    chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
+    if patterns:  # a subset that was not asked for is not missing
+        missing = [one for one in missing if any(matches(name, patterns) for name in one.subsets)]
+    folder = Path(out or Path("reports") / Path(release).name)
+    claim_folder(folder, data, budget, training=bool(cells))
+    results = []
+    with progress_bar(progress, " checks", "structure", scaled=False) as bar:
+        structure = check_structure(chosen, budget.backgrounds, bar, workers)
+        if structure.sound or train_unsound:
+            bar.unit = " steps"
+            bar.reset(planned_steps(budget, cells))
+            for cell, result in run_cells(release, folder, budget, cells, workers, bar.advance):
+                on_score(budget, cell, result)
+                results.append((cell, result))
+    results.sort(key=lambda pair: cells.index(pair[0]))
+    known = {cell for cell, _ in results}
+    shown = [*results, *(kept for kept in kept_results(data, folder, budget) if kept[0] not in known)]
+    warnings = (*structure.warnings, *training_warnings(data, budget, shown))
+    planned = dict.fromkeys([*cells, *(cell for cell, _ in shown)])
+    facts = report_facts(chosen, budget, structure, len(planned), shown, missing, warnings)
+    facts |= {"seconds": time.perf_counter() - started}
+    page = write_report(folder, facts, shown)
+    there, asked = (facts["episodes"][name] for name in ("there", "asked"))
+    json_file = page.with_suffix(".json")
+    return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), page, json_file)
+
+
+def _refuse_training(**given: Any) -> None:
+    """Refuse options of the training, which is left out."""
+    usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
+    changed = {name: value != usual[name] for name, value in given.items()}
+    refuse("--checks-only trains nothing", benchmark=changed.pop("benchmarks"), **changed)
+
+
+def agent_names(agents: Names | None, dino_weights: Location | None) -> list[str]:
+    """The names of the agents that are asked for, one a text or several with commas.
+
+    Raises:
+      DmcvbError: one is unknown, or lacks weights, or none needs those that are given.
+    """
+    from dmcvb_gen.agents.catalog import parse_agent
+
+    names = [name.strip() for text in as_names(agents) for name in text.split(",") if name.strip()]
     encoders = [agent.ready_encoder for agent in map(parse_agent, names) if agent.ready_encoder]
     if dino_weights is not None and not encoders:
         raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
     if dino_weights is None and encoders:
         raise DmcvbError(encoders[0].missing)
-    workers = workers or default_workers(device)
-    told = ("profile", "scale", "threads", "device", "precision", "compile", "memory", "seed")
-    told += ("dino_weights", "backgrounds")
-    budget = report.make_budget(workers=workers, **{name: given[name] for name in told})
-    with progress_bar(progress, " checks", "structure", scaled=False) as bar:
+    return names
 
-        def train(steps: int) -> None:
-            bar.unit = " steps"
-            bar.reset(steps)
 
-        return report.validate(
-            release,
-            out or Path("reports") / Path(release).name,
-            budget,
-            benchmarks=() if checks_only else as_names(benchmarks),
-            agents=names,
-            patterns=as_names(only),
-            workers=workers,
-            train_unsound=train_unsound,
-            progress=report.Progress(
-                checking=bar, total=train, training=bar.advance, done=lambda *found: on_score(budget, *found)
-            ),
-        )
+def make_budget(
+    profile: str = "smoke",
+    scale: float = 1.0,
+    workers: Workers = 1,
+    threads: int | None = None,
+    device: str = "cpu",
+    precision: str = "auto",
+    memory: float | None = None,
+    **fields: Any,
+) -> "Budget":
+    """The budget of a validation.
+
+    Args:
+      workers: number of workers that share the cores; each gets as many threads as are left, on a cluster one.
+      memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
+      fields: others of `Budget`.
+
+    Raises:
+      DmcvbError: an unknown profile, or a device that is not here.
+    """
+    import torch
+
+    from dmcvb_gen.benchmarks.plan import get_budget
+    from dmcvb_gen.parallel.cores import usable_cores
+    from dmcvb_gen.precision import choose_precision
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
+    return dataclasses.replace(
+        get_budget(profile).scaled(scale),
+        device=device,
+        precision=choose_precision(precision, device),
+        threads=threads or (max(1, usable_cores() // workers) if isinstance(workers, int) else 1),
+        memory=None if memory is None else int(memory * 1e9),
+        **{name: str(value) if isinstance(value, Path) else value for name, value in fields.items()},
+    )

@@ -162,11 +162,7 @@ def parse_part(flag: str, text: str) -> tuple[int, int]:
 
 
 def split_names(flag: str, text: str) -> tuple[str, ...]:
-    """ "bc,id+bc:k=10,sample" -> ("bc", "id+bc:k=10,sample"): commas stand between names and in agents' options."""
-    if ":" in text:  # agents are not loaded for less
-        from dmcvb_gen.agents.catalog import split_agents
-
-        return split_agents(text)
+    """ "bc,id+bc" -> ("bc", "id+bc")."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 

@@ -10,16 +10,14 @@ import click
 from dmcvb_gen.benchmarks.validate import validate as run
 from dmcvb_gen.cli.common import answer
 from dmcvb_gen.cli.options import command_of
-from dmcvb_gen.own_code import is_own
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import pluralize
 
 
 @command_of(run)
-@click.option("--agent", "own", multiple=True, metavar="MODULE:NAME", help="Also score your own agent. Repeatable.")
 @click.option("--strict", is_flag=True, help="Exit with 1 on warnings (data unlike the paper's).")
-def validate(own, strict, as_json, **options):
+def validate(strict, as_json, **options):
     """Check a release, run the paper's benchmarks on it and compare the scores with the paper's.
 
     Exit code 0: the release is complete and all checks passed. 1: a check or a cell failed, or episodes are missing.
@@ -29,7 +27,6 @@ def validate(own, strict, as_json, **options):
     dmcvb-gen validate releases/mini --profile smoke
     dmcvb-gen validate releases/mini --profile quick --agents bc,id+bc
     """
-    options["agents"] = _agents(options["agents"], own, options["benchmarks"])
     result = run(on_score=ignore if as_json else _show_score, **options)
     code = 0 if result.sound and result.complete and not (strict and result.warnings) else 1
     facts = json.loads(result.facts.read_text())
@@ -50,24 +47,13 @@ def _show_score(budget, cell, facts) -> None:
         click.echo(f"{cell.place} {cell.agent.name}: {score}{goal}{beside}")
 
 
-def _agents(names: tuple[str, ...] | None, own: tuple[str, ...], benchmarks: tuple[str, ...]) -> list[str]:
-    """The agents asked for; one's own alone are set beside BC from states, in benchmarks that take it."""
-    from dmcvb_gen.benchmarks.plan import BENCHMARKS
-
-    for name in own:
-        if not is_own(name):
-            raise click.UsageError(f"--agent {name} is not MODULE:NAME; the paper's agents are chosen with --agents.")
-    beside = own and not names and any(not BENCHMARKS.get(name).compares_encoders for name in benchmarks)
-    return [*(names or ()), *(["state-bc"] if beside else []), *own]
-
-
 def _validated(result, note) -> Iterator[str]:
     """Yield the result of validate in lines."""
     yield from (f"FAIL {finding}" for finding in result.structure.findings[:50])
     yield from (f"FAIL {cell.id}: {error}" for cell, error in result.failed)
     yield from (f"warning: {finding}" for finding in result.warnings)
     for entry in result.missing:
-        yield f"{entry.benchmark}: not in the release: {', '.join(entry.subsets)}; to get them: {entry.command}"
+        yield f"{entry.benchmark}: not in the release: {', '.join(entry.subsets)}"
     checked = ", ".join(pluralize(count, name) for name, count in result.structure.checked.items())
     found = len(result.structure.findings) + len(result.failed)
     yield f"{'All checks passed' if result.sound else pluralize(found, 'findings')} ({checked})."

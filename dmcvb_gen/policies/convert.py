@@ -14,8 +14,7 @@ Nothing is unpickled: parameters are read by torch's weights-only loader, and of
     torch.nn.Sequential               0, 2, ...                       the last     none
 
 Sizes come from the weights and must fit the task. Converted policies act by our fixed-order arithmetic, so their data
-regenerate bit for bit; their actions agree with the other program's to rounding, and where SB3 is installed that is
-checked with its own `predict`.
+regenerate bit for bit; their actions agree with the other program's to rounding.
 """
 
 from __future__ import annotations
@@ -34,10 +33,9 @@ import pydantic
 
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.policy_file import check_weights, load_policy, save_policy
-from dmcvb_gen.policies.sb3_zip import Facts, facts_of, predict, read_members
+from dmcvb_gen.policies.sb3_zip import Facts, facts_of, read_members
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -48,10 +46,6 @@ NO_NOISE = -80.0
 """Log standard deviation of a policy that keeps its mean action alone."""
 WRAPPERS = re.compile(r"^(_orig_mod\.|module\.)+")
 """What torch.compile and DataParallel put before every name."""
-AGREEMENT = 1e-3
-"""Largest difference between our actions and SB3's, of a range from -1 to 1."""
-
-
 SCALES = ("action_scale", "action_bias")
 """Names of the half width and the middle of the actions' bounds, as CleanRL keeps them."""
 
@@ -180,7 +174,6 @@ def convert(
         raise PolicyFileError(f"{path}: {problem['loc'][0]}: {problem['msg']}; give a smaller MLP") from None
     check_weights(path, header, weights)
     if facts:
-        _compare(path, header, weights, facts, state)
         first = "body.0.weight" if body else "mean.weight"
         weights[first] = weights[first][:, np.argsort(_order(path, task, facts))]
     return header, weights
@@ -285,31 +278,6 @@ def _order(path: Path, task: Task, facts: Facts) -> np.ndarray:
         )
     places = np.arange(task.behaviour_size)
     return np.concatenate([places[task.state_slices[name]] for name in facts.fields])
-
-
-def _compare(
-    path: Path,
-    header: PolicyHeader,
-    weights: Mapping[str, np.ndarray],
-    facts: Facts,
-    state: Mapping[str, np.ndarray],
-) -> None:
-    """Refuse a policy that acts otherwise than SB3 does on normalized observations in the zip's order."""
-    size = header.observation_size
-    seen = np.random.default_rng(0).normal(size=(64, size)).astype(np.float32)
-    actor = {name: value for name, value in state.items() if not name.startswith(CRITICS)}
-    theirs = predict(facts, actor, header.distribution, header.hidden, seen)
-    plain = header.model_copy(update={"clip_observation": UNCLIPPED})
-    ours = Policy(plain, {**weights, **_normalization(None, size)}, "").act(seen, deterministic=True)
-    if theirs is None:
-        return
-    unit = 2 * (theirs - facts.low) / (facts.high - facts.low) - 1
-    off = float(np.abs(ours - unit).max())
-    if off > AGREEMENT:
-        raise PolicyFileError(
-            f"{path} acts by {off:.2g} otherwise than Stable-Baselines3 does; it has a part that is not known here, so "
-            "give it as a function of your own with --behaviour MODULE:FUNCTION"
-        )
 
 
 def _weights(

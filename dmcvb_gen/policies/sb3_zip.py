@@ -1,4 +1,4 @@
-"""Read a Stable-Baselines3 zip without unpickling: the plain JSON beside its weights, and SB3's own actions from both.
+"""Read a Stable-Baselines3 zip without unpickling: its weights' bytes, and the plain JSON beside them.
 
 The JSON decides what the weights mean: the actions' bounds, the order of observations, what lies before the first
 layer. What a plain MLP does not have is refused, and named.
@@ -122,44 +122,3 @@ def _fields(path: Path, space: Mapping[str, Any]) -> dict[str, int] | None:
     if kind != "Dict" or not fields or len(fields) != len(re.findall(r"'[^']+'[:,] ", text)):
         raise _refusal(path, f"observations that are no vectors ({kind})")
     return fields
-
-
-def predict(
-    facts: Facts, state: Mapping[str, np.ndarray], distribution: str, hidden: tuple[int, ...], seen: np.ndarray
-) -> np.ndarray | None:
-    """SB3's own mean actions, (n, action), for observations in the zip's order; None if SB3 is not installed.
-
-    Args:
-      state: the actor's parameters by the zip's names.
-      distribution: of the policy file.
-      hidden: widths of the actor's hidden layers.
-      seen: (n, observation) float32.
-    """
-    try:
-        from gymnasium.spaces import Box, Dict
-        from stable_baselines3.common.policies import ActorCriticPolicy, MultiInputActorCriticPolicy
-        from stable_baselines3.sac import policies as sac
-        from stable_baselines3.td3 import policies as td3
-    except ImportError:
-        return None
-    import torch
-    from torch import nn
-
-    kinds = {
-        "squashed_gaussian": (sac.SACPolicy, sac.MultiInputPolicy),
-        "deterministic": (td3.TD3Policy, td3.MultiInputPolicy),
-        "gaussian": (ActorCriticPolicy, MultiInputActorCriticPolicy),
-    }
-    fields = facts.fields or {"all": seen.shape[1]}
-    parts = dict(zip(fields, np.split(seen, np.cumsum(list(fields.values()))[:-1], axis=1), strict=True))
-    boxes = {name: Box(-np.inf, np.inf, part.shape[1:], np.float32) for name, part in parts.items()}
-    space = Dict(list(boxes.items())) if facts.fields else boxes["all"]
-    options: dict[str, Any] = {"net_arch": {"pi": list(hidden), "qf": [1], "vf": [1]}}
-    if facts.activation:
-        functions = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
-        options["activation_fn"] = functions[facts.activation]
-    bounds = Box(facts.low.astype(np.float32), facts.high.astype(np.float32))
-    policy = kinds[distribution][bool(facts.fields)](space, bounds, lambda _: 0.0, **options)
-    policy.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()}, strict=False)
-    action, _ = policy.predict(parts if facts.fields else seen, deterministic=True)
-    return action

@@ -105,7 +105,7 @@ class Student:
         torch.manual_seed(run.config.seed)
         self.way = WaypointNetwork((settings.width,) * settings.layers)
         self.optimizer = torch.optim.Adam(self.way.parameters(), lr=settings.learning_rate, fused=True)
-        rows = max(min(settings.buffer_size, run.config.steps), settings.simulations)
+        rows = max(settings.buffer_size, settings.simulations)
         self.buffer = RowBuffer(rows, {"place": (WAY_SIZE,), "heading": (2,)})
         self.rng = np.random.default_rng([run.config.seed, 0xB0FF])
         self.noise = self.rng.spawn(settings.simulations)

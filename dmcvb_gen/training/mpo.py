@@ -16,19 +16,16 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
 import torch
-from pydantic import Field
 from torch import nn
 from torch.nn.functional import softplus
 
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import PolicyHeader
-from dmcvb_gen.training.episodes import RewardedEpisodeSettings
 from dmcvb_gen.training.run import Run
-from dmcvb_gen.training.sac import Collector, CriticEnsemble, Learner, check_replay, network
-from dmcvb_gen.training.settings import Count, Decay, Hidden, Natural, Positive, Share
+from dmcvb_gen.training.sac import Collector, CriticEnsemble, Learner, ReplaySettings, check_replay, network
+from dmcvb_gen.training.settings import Count, Positive
 
 __all__ = ["Mpo", "Settings", "check", "network", "train"]
 
@@ -37,22 +34,14 @@ SMALLEST = 1e-8
 
 
 @dataclass(frozen=True)
-class Settings(RewardedEpisodeSettings):
+class Settings(ReplaySettings):
     """Settings of MPO.
 
     Attributes:
       updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
-      warmup_steps: agent steps of uniform random actions before the first update.
-      buffer_size: agent steps remembered.
-      batch_size: transitions an update.
-      actor_hidden: widths of the policy's hidden layers.
-      critic_hidden: widths of each critic's hidden layers.
-      critics: number of critics; their mean is used.
       learning_rate: learning rate of policy and critics.
-      discount: discount of an agent step.
       n_step: rewards summed before a target bootstraps, on the way that the episode really took.
       reward_scale: multiplies rewards before learning.
-      greedy_fraction: share of the simulations that act by the mean, as data are made.
       action_samples: actions drawn from the target policy for each state.
       epsilon: bound on the KL divergence of the weighted actions from the target policy (E-step).
       epsilon_mean, epsilon_std: bound on the M-step's KL divergence through the mean, and through the deviation.
@@ -61,21 +50,12 @@ class Settings(RewardedEpisodeSettings):
         deviation, at the start; it is learned.
       dual_learning_rate: learning rate of temperature and multipliers.
       target_period: updates after which the target networks become copies of policy and critics.
-      compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
 
     updates_per_step: Positive = 0.5
-    warmup_steps: Natural = 5000
-    buffer_size: Count = 1_000_000
-    batch_size: Count = 256
-    actor_hidden: Hidden = (256, 256)
-    critic_hidden: Annotated[Hidden, Field(min_length=1)] = (256, 256)
-    critics: Count = 2
     learning_rate: Positive = 3e-4
-    discount: Decay = 0.99
     n_step: Count = 1
     reward_scale: Positive = 1.0
-    greedy_fraction: Share = 0.0
     action_samples: Count = 20
     epsilon: Positive = 0.1
     epsilon_mean: Positive = 0.01
@@ -85,7 +65,6 @@ class Settings(RewardedEpisodeSettings):
     initial_multiplier_std: Positive = 10.0
     dual_learning_rate: Positive = 1e-2
     target_period: Count = 100
-    compile: bool = True
 
 
 def temperature_loss(values: torch.Tensor, temperature: torch.Tensor, epsilon: float) -> torch.Tensor:

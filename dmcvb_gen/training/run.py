@@ -4,7 +4,7 @@ A run folder holds
 
     run.json                              what is trained; only its number of steps changes
     checkpoints/<agent step>.safetensors  a policy file an evaluation, and one where the run was stopped
-    progress.csv, tensorboard/            a row, a point an evaluation
+    progress.jsonl                        a line an evaluation
     resume/state.safetensors              learner, replay buffer, simulations, random states
     selected/, selection.json, curve.png  written by the selection
 
@@ -245,20 +245,11 @@ class Run:
                 self._drop_later_checkpoints()
                 self._log = RunLog(self.folder, self.step)
                 self._began = self._last_saved = time.time()
-                try:
-                    with self._stopping_on_signals(stopping):
-                        self.algorithm.train(self)
-                finally:
-                    self._log.close()
+                with self._stopping_on_signals(stopping):
+                    self.algorithm.train(self)
 
     def write_config(self) -> None:
-        """Write run.json.
-
-        Raises:
-          DmcvbError: another process has begun another run in the folder.
-        """
-        if found := read_config(self.folder):
-            check_same(self.folder, found, self.config)
+        """Write run.json."""
         write_json(self.folder / "run.json", json.loads(json.dumps(dataclasses.asdict(self.config))))
 
     def resume_command(self) -> str:
@@ -336,7 +327,7 @@ class Run:
         for step, path in checkpoints(self.folder).items():
             if step > self.step:
                 path.unlink()
-        for folder in ("checkpoints", "resume"):
+        for folder in (".", "checkpoints", "resume"):
             remove_partial(self.folder / folder)
 
     @contextlib.contextmanager

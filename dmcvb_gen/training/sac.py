@@ -39,22 +39,43 @@ from dmcvb_gen.training.settings import Count, Decay, Hidden, Natural, NonNegati
 
 
 @dataclass(frozen=True)
-class Settings(RewardedEpisodeSettings):
-    """Settings of SAC; those of mazes are in defaults.yaml.
+class ReplaySettings(RewardedEpisodeSettings):
+    """Settings of a learner with a replay buffer.
 
     Attributes:
-      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       warmup_steps: agent steps of uniform random actions before the first update.
       buffer_size: agent steps remembered.
       batch_size: transitions an update.
       actor_hidden: widths of the policy's hidden layers.
       critic_hidden: widths of each critic's hidden layers.
-      critics: number of critics.
+      critics: number of critics; their mean is used.
+      discount: discount of an agent step.
+      greedy_fraction: share of the simulations that act by the mean, as data are made: a policy that only ever collects
+        with noise never sees the places where its mean stands still.
+      compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
+    """
+
+    warmup_steps: Natural = 5000
+    buffer_size: Count = 1_000_000
+    batch_size: Count = 256
+    actor_hidden: Hidden = (256, 256)
+    critic_hidden: Annotated[Hidden, Field(min_length=1)] = (256, 256)
+    critics: Count = 2
+    discount: Decay = 0.99
+    greedy_fraction: Share = 0.0
+    compile: bool = True
+
+
+@dataclass(frozen=True)
+class Settings(ReplaySettings):
+    """Settings of SAC; those of mazes are in defaults.yaml.
+
+    Attributes:
+      updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       learning_rate: learning rate of policy and critics.
       rate_half_life: agent steps after which learning rates have fallen to 1 / sqrt(2); they fall with the square root
         of the steps (0: never).
       weight_decay: weight decay of AdamW, on actor and critics.
-      discount: discount of an agent step.
       actor_every: an actor update every so many critic updates.
       target_decay: share of the target critics that an update keeps.
       reward_scale: multiplies rewards before learning; 0: the inverse of the spread of discounted returns, as it grows.
@@ -68,23 +89,13 @@ class Settings(RewardedEpisodeSettings):
         swings from checkpoint to checkpoint; the end of a run can do without both.
       final_entropy_scale: see `anneal_after`.
       final_learning_rate: see `anneal_after`; 0: as before.
-      greedy_fraction: share of the simulations that act by the mean, as data are made: a policy that only ever collects
-        with noise never sees the places where its mean stands still.
       bfloat16: hidden layers' products in bfloat16 (weights and optimizer stay float32).
-      compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
     """
 
     updates_per_step: Positive = 1.0
-    warmup_steps: Natural = 5000
-    buffer_size: Count = 1_000_000
-    batch_size: Count = 256
-    actor_hidden: Hidden = (256, 256)
-    critic_hidden: Annotated[Hidden, Field(min_length=1)] = (256, 256)
-    critics: Count = 2
     learning_rate: Positive = 1e-3
     rate_half_life: Natural = 100_000
     weight_decay: NonNegative = 0.0
-    discount: Decay = 0.99
     actor_every: Count = 2
     target_decay: Decay = 0.995
     reward_scale: NonNegative = 0.0
@@ -95,9 +106,7 @@ class Settings(RewardedEpisodeSettings):
     anneal_after: Natural = 0
     final_entropy_scale: float = 1.5
     final_learning_rate: NonNegative = 0.0
-    greedy_fraction: Share = 0.0
     bfloat16: bool = False
-    compile: bool = True
 
 
 RETURN_LIMIT = 5.0
@@ -207,13 +216,11 @@ class RowBuffer:
         return {"rows": rows, "position": self.position, "full": self.full}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state()`; a ring that has grown begins with the oldest row."""
-        found = len(next(iter(state["rows"].values())))
-        grown = state["full"] and self.size > found
+        """Continue from `state()`."""
         for name, array in self.arrays.items():
             rows = state["rows"][name].numpy()
-            array[:found] = np.roll(rows, -state["position"], axis=0) if grown else rows
-        self.position, self.full = (found, False) if grown else (state["position"], state["full"])
+            array[: len(rows)] = rows
+        self.position, self.full = state["position"], state["full"]
 
 
 class ReplayBuffer(RowBuffer):
@@ -523,7 +530,7 @@ class Collector:
         settings, config, task = run.settings, run.config, run.task
         self.run, self.learner, self._owed = run, learner, 0.0  # updates that are due
         self.rng = np.random.default_rng([config.seed, 0xB0FF])
-        rows = max(min(settings.buffer_size, config.steps), settings.simulations)
+        rows = max(settings.buffer_size, settings.simulations)
         self.buffer = ReplayBuffer(rows, task.behaviour_size, task.action_size, settings.simulations)
         self.episodes = Episodes(task, settings, config.seed, self.rng)
         if saved := run.saved():

@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,7 +33,6 @@ from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.text import pluralize
-from dmcvb_gen.training.run import read_config
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -312,7 +311,7 @@ def select_checkpoints(
     expect(progress, len(measured))
     with storage_errors(folder, "write to"):
         _write(folder, curve, selection, measured)
-    plot_selection(curve, selection, folder / "curve.png")
+    plot_curve(folder, selection=selection)
     return selection
 
 
@@ -360,57 +359,49 @@ def selection_json(selection: Selection) -> dict:
     }
 
 
-def plot_selection(curve: Sequence[Point], selection: Selection, path: Path) -> None:
-    """The learning curve with the picks marked, a PNG."""
-    colors = {"expert": "tab:green", "medium": "tab:orange", "mixed": "tab:red"}
-    with _curve_figure(curve, selection.task, path) as axes:
-        end = selection.convergence.value
-        axes.axhline(end, color="tab:blue", linestyle=":", linewidth=1)
-        axes.text(curve[0][0], end, f" convergence {end:.0f}", va="bottom")
-        axes.set_xscale("function", functions=(np.sqrt, np.square))  # medium is within the first tenth
-        axes.set_xlim(0, curve[-1][0])
-        axes.locator_params(axis="x", nbins=5)
-        # Medium is often the last of the mixed: its ring goes around that one.
-        for level, size, filled in (("mixed", 5, True), ("medium", 9, False), ("expert", 7, True)):
-            if picks := selection.picks.get(level):
-                steps, means = [pick.step for pick in picks], [pick.evaluation.mean for pick in picks]
-                look = dict(fmt="o", color=colors[level], markersize=size, capsize=2, zorder=3)
-                look["markerfacecolor"] = colors[level] if filled else "none"
-                spread, label = [pick.evaluation.std for pick in picks], f"{level} (fresh episodes)"
-                axes.errorbar(steps, means, spread, label=label, **look)
-
-
-def plot_curve(folder: str | Path, expert: float | None = None) -> Path:
+def plot_curve(folder: str | Path, expert: float | None = None, selection: Selection | None = None) -> Path:
     """Draw a run's learning curve into its folder as curve.png.
 
     Args:
       expert: mean return of the paper's expert, drawn beside it.
+      selection: its picks are marked.
 
     Returns:
       The picture's path.
     """
-    path, curve = Path(folder) / "curve.png", read_curve(Path(folder))
-    config = read_config(folder)
-    with _curve_figure(curve, config.task if config else "", path) as axes:
-        if expert is not None:
-            axes.axhline(expert, color="0.3", linestyle="--", linewidth=1, label=f"the paper's expert, {expert:.0f}")
-    return path
-
-
-@contextlib.contextmanager
-def _curve_figure(curve: Sequence[Point], task: str, path: Path) -> Iterator[Axes]:
-    """Axes with a learning curve to draw more on; the picture is written at the end."""
     from matplotlib.figure import Figure  # not pyplot, whose backend is the caller's
 
+    path, curve = Path(folder) / "curve.png", read_curve(folder)
     steps, returns = [step for step, _, _ in curve], [value for _, value, _ in curve]
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     axes.plot(steps, returns, color="0.75", linewidth=1, label="evaluations along the way")
     axes.plot(steps, smooth(returns), color="tab:blue", label="smoothed")
-    yield axes
-    axes.set(xlabel="agent steps", ylabel="episode return", title=task_folder(task) if task else "")
+    if expert is not None:
+        axes.axhline(expert, color="0.3", linestyle="--", linewidth=1, label=f"the paper's expert, {expert:.0f}")
+    if selection:
+        _mark_picks(axes, selection, steps)
+    axes.set(xlabel="agent steps", ylabel="episode return", title=task_folder(read_header(curve[0][2]).task))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
     with storage_errors(path, "write to"):
         figure.savefig(path, dpi=110)
+    return path
+
+
+def _mark_picks(axes: Axes, selection: Selection, steps: Sequence[int]) -> None:
+    end = selection.convergence.value
+    axes.axhline(end, color="tab:blue", linestyle=":", linewidth=1)
+    axes.text(steps[0], end, f" convergence {end:.0f}", va="bottom")
+    axes.set_xscale("function", functions=(np.sqrt, np.square))  # medium is within the first tenth
+    axes.set_xlim(0, steps[-1])
+    axes.locator_params(axis="x", nbins=5)
+    # Medium is often the last of the mixed: its ring goes around that one.
+    looks = {"mixed": ("tab:red", 5, True), "medium": ("tab:orange", 9, False), "expert": ("tab:green", 7, True)}
+    for level, (color, size, filled) in looks.items():
+        picks = selection.picks.get(level, ())
+        points = [(pick.step, pick.evaluation.mean, pick.evaluation.std) for pick in picks]
+        if points:
+            look = dict(color=color, markersize=size, markerfacecolor=color if filled else "none", capsize=2, zorder=3)
+            axes.errorbar(*zip(*points, strict=True), fmt="o", label=f"{level} (fresh episodes)", **look)

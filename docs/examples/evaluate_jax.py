@@ -1,7 +1,6 @@
 """A policy of your own from states in JAX, scored as `validate` scores its agents.
 
 python evaluate_jax.py releases/demo walker-walk/expert/dynamic
-dmcvb-gen validate releases/demo --agent evaluate_jax:train
 """
 
 import sys
@@ -16,13 +15,13 @@ import dmcvb_gen
 STEPS = 2_000
 
 
-def train(data):
-    """A policy from `data.source`: gather(indices) gives "state" and "action" of steps as numpy arrays."""
-    source, rng = data.source, np.random.default_rng(data.seed)
+def train(source, seed=0):
+    """A policy from a source of steps: gather(indices) gives "state" and "action" of steps as numpy arrays."""
+    rng = np.random.default_rng(seed)
     every = source.gather(np.arange(len(source)))
     mean, scale = every["state"].mean(axis=0), every["state"].std(axis=0) + 1e-3
     sizes = (every["state"].shape[1], 256, 256, every["action"].shape[1])
-    keys = jax.random.split(jax.random.key(data.seed), len(sizes) - 1)
+    keys = jax.random.split(jax.random.key(seed), len(sizes) - 1)
     make = jax.nn.initializers.orthogonal()
     weights = [make(key, shape) for key, shape in zip(keys, zip(sizes[:-1], sizes[1:], strict=True), strict=True)]
 
@@ -46,15 +45,11 @@ def train(data):
     return lambda observation: act(observation["state"])  # (episode, state) -> (episode, action) in [-1, 1]
 
 
-train.pixels = False  # its policy asks for no images, which makes an evaluation quick
-
 if __name__ == "__main__":
-    from types import SimpleNamespace
-
     release, subset = sys.argv[1:3]
     episodes, steps = (int(value) for value in (*sys.argv[3:], 30, 500)[:2])  # fewer and shorter ones to try it
     source = dmcvb_gen.open(release)[subset].source(pictures=())
-    policy = train(SimpleNamespace(source=source, seed=0))
+    policy = train(source)
     task, _, setting = subset.split("/")
     score = dmcvb_gen.evaluate(policy, f"{task}/{setting}", episodes=episodes, pixels=False, max_steps=steps)
     print(f"return {score.mean:.1f} +- {score.stderr:.1f} over {len(score.returns)} episodes")

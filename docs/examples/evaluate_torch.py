@@ -1,7 +1,6 @@
 """A policy of your own from images in torch, scored as `validate` scores its agents.
 
 python evaluate_torch.py releases/demo walker-walk/expert/dynamic
-dmcvb-gen validate releases/demo --agent evaluate_torch:train
 """
 
 import sys
@@ -14,9 +13,9 @@ import dmcvb_gen
 STEPS = 100
 
 
-def train(data):
-    """A policy from `data.source`: gather(indices) gives "pixels", "state", "action" of steps as numpy arrays."""
-    source, generator = data.source, torch.Generator().manual_seed(data.seed)
+def train(source, seed=0):
+    """A policy from a source of steps: gather(indices) gives "pixels", "state", "action" of steps as numpy arrays."""
+    generator = torch.Generator().manual_seed(seed)
     network = nn.Sequential(
         nn.LazyConv2d(32, 4, stride=4),
         nn.ReLU(),
@@ -45,12 +44,10 @@ def train(data):
 
 
 if __name__ == "__main__":
-    from types import SimpleNamespace
-
     release, subset = sys.argv[1:3]
     episodes, steps = (int(value) for value in (*sys.argv[3:], 30, 500)[:2])  # fewer and shorter ones to try it
     source = dmcvb_gen.open(release)[subset].source(stack=3, pictures="agents")
-    policy = train(SimpleNamespace(source=source, seed=0))
+    policy = train(source)
     task, _, setting = subset.split("/")
     size = source[0]["pixels"].shape[-1]
     score = dmcvb_gen.evaluate(policy, f"{task}/{setting}", episodes=episodes, size=size, max_steps=steps)

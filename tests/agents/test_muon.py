@@ -73,15 +73,3 @@ def test_an_optimizer_that_an_agent_chose_stays_with_its_settings(other, setting
     plain = torch.optim.Adam([weight], lr=0.02)
     [group] = Muon.instead_of(plain, torch.float32).param_groups
     assert group["lr"] == 0.02 and group["params"][0] is weight
-
-
-def test_a_saved_state_goes_on_where_it_was():
-    start, steps = torch.randn(64, 64), gradients((64, 64), 8)
-    whole = nn.Parameter(start.clone())
-    expected = descend(Muon([whole], 0.01), whole, steps)
-    weight = nn.Parameter(start.clone())
-    before = Muon([weight], 0.01)
-    descend(before, weight, steps[:3])
-    after = Muon([weight], 0.01)
-    after.load_state_dict(before.state_dict())
-    torch.testing.assert_close(descend(after, weight, steps[3:]), expected, rtol=0, atol=0)

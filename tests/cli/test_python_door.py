@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import dmcvb_gen
-from dmcvb_gen.benchmarks.report import make_budget
+from dmcvb_gen.benchmarks.validate import make_budget
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError

@@ -18,7 +18,7 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[2]
 READING = ("numpy", "zarr", "numcodecs", "fsspec", "pydantic", "click", "rich", "tqdm", "filelock", "tenacity", "h5py")
 """What one who only reads, fetches and exports to HDF5 installs (each brings what it needs)."""
-HEAVY = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard")
+HEAVY = ("torch", "stable_baselines3", "sb3_contrib")
 HEAVY += ("matplotlib", "imageio", "imageio_ffmpeg", "xarray", "pandas")
 """What the core does without."""
 

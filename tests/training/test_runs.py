@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import fcntl
 import io
 import multiprocessing
@@ -16,7 +15,6 @@ import signal
 import numpy as np
 import pytest
 import torch
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
@@ -29,8 +27,7 @@ from dmcvb_gen.training.behaviour import run_config, train_behaviour
 from dmcvb_gen.training.episodes import standing_states
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.run import Run, RunConfig, Stopped, check_same, open_run
-from dmcvb_gen.training.run_log import COLUMNS, read_rows
-from dmcvb_gen.training.sac import ReplayBuffer
+from dmcvb_gen.training.run_log import LOG, read_rows
 from dmcvb_gen.training.settings import default_run
 
 SAC = dict(warmup_steps=24, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4)
@@ -107,15 +104,10 @@ def test_a_run_leaves_policies_that_say_what_they_are_and_logs_that_tell_the_sam
     task, algorithm, _ = CASES[case]
     run = train(tmp_path / "run", case=case)
     rows = read_rows(run.folder)
-    assert [row["step"] for row in rows] == ["80", "160"] and tuple(rows[0]) == COLUMNS and names(run) == [80, 160]
-    with (run.folder / "progress.csv").open() as file:
-        assert list(csv.DictReader(file)) == rows
-    events = EventAccumulator(str(run.folder / "tensorboard"))
-    events.Reload()
-    for row, event in zip(rows, events.Scalars("evaluation/return_mean"), strict=True):
-        assert event.step == int(row["step"]) and event.value == pytest.approx(float(row["return_mean"]), rel=1e-5)
-        header = load_policy(run.folder / "checkpoints" / f"{event.step:010d}.safetensors", get_task(task)).header
-        assert header.evaluation.mean == pytest.approx(event.value, rel=1e-5) and header.agent_step == event.step
+    assert [row["step"] for row in rows] == names(run) == [80, 160] and rows[1]["seconds"] >= rows[0]["seconds"]
+    for row in rows:
+        header = load_policy(run.folder / "checkpoints" / f"{row['step']:010d}.safetensors", get_task(task)).header
+        assert header.evaluation.mean == row["return_mean"] and header.agent_step == row["step"]
         assert header.algorithm == algorithm
         assert header.command.startswith(f"dmcvb-gen train-behaviour {task} --algo {algorithm} --steps 160 --seed 0")
 
@@ -177,8 +169,8 @@ def test_ten_kills_at_random_moments_change_nothing(tmp_path, case, steps, every
         process.join()
         kills += process.exitcode == -signal.SIGKILL
     assert kills >= 2
-    with (tmp_path / "killed" / "progress.csv").open("a") as file:
-        file.write("99")  # a line half written
+    with (tmp_path / "killed" / LOG).open("a") as file:
+        file.write('{"step": 99')  # a line half written
     (tmp_path / "killed" / "resume" / ".state.safetensors.x.partial").write_bytes(b"half")
     killed = train(tmp_path / "killed", True, **fields)
     assert killed.step == whole.step == steps and not list((tmp_path / "killed").rglob("*.partial"))
@@ -204,36 +196,6 @@ def test_a_disk_that_fills_up_while_saving_leaves_the_previous_state(tmp_path):
         train(tmp_path / "run", True)
     assert path.read_bytes() == before and not list((tmp_path / "run").rglob("*.partial"))
     assert_same_run(train(tmp_path / "whole"), train(tmp_path / "run", True))
-
-
-def test_a_disk_that_fills_up_while_a_checkpoint_is_written_leaves_no_half_of_it(tmp_path):
-    train(tmp_path / "run", steps=80)
-    with largest_file(2000), pytest.raises(DmcvbError, match="previous saved state is whole"):
-        train(tmp_path / "run", True)
-    assert names(open_run(tmp_path / "run", config(), True)) == [80]
-
-
-def filled(size, rounds, old=None):
-    """A ring of one simulation whose row i holds i, after so many rounds."""
-    buffer = ReplayBuffer(size, 1, 1, 1)
-    if old:
-        buffer.load_state(old.state())
-    for value in range(rounds[0], rounds[1]):
-        row = np.full((1, 1), value, np.float32)
-        buffer.add(observation=row, next_observation=row, action=row, reward=row[0], terminated=[0], ended=[0])
-    return buffer
-
-
-@pytest.mark.parametrize("rounds", [4, 6, 9, 14])
-def test_a_run_that_is_made_longer_keeps_its_replay_buffer_in_order(rounds):
-    longer = filled(20, (rounds, rounds + 3), filled(6, (0, rounds)))
-    kept = range(max(rounds - 6, 0), rounds + 3)
-    assert len(longer) == len(kept) and longer.arrays["reward"][: len(kept)].tolist() == list(kept)
-    batch = longer.sample_steps(np.random.default_rng(0), 60, 3, 1.0)
-    led = dict(zip(batch["observation"][:, 0].tolist(), batch["next_observation"][:, 0].tolist(), strict=True))
-    assert all(end == min(start + 2, rounds + 2) for start, end in led.items())
-    same = filled(6, (0, 0), filled(6, (0, rounds)))
-    assert same.arrays["reward"].tolist() == filled(6, (0, rounds)).arrays["reward"].tolist()
 
 
 def test_checkpoints_whose_saved_state_is_gone_are_not_written_over(tmp_path):
@@ -270,14 +232,6 @@ def test_two_processes_do_not_train_in_one_folder(tmp_path):
         with pytest.raises(DmcvbError, match="another process"):
             open_run(tmp_path / "run", config(steps=200), True).train()
         assert (tmp_path / "run" / "run.json").read_bytes() == before  # it says what the other one trains
-
-
-def test_a_run_looks_again_when_it_is_alone(tmp_path):
-    late = open_run(tmp_path / "run", config(), False)
-    (tmp_path / "run" / "run.json").unlink()
-    train(tmp_path / "run", seed=1)
-    with pytest.raises(DmcvbError, match="with seed 1, asked for 0"):
-        late.train()
 
 
 def test_a_finished_run_that_went_a_few_steps_too_far_resumes_to_what_it_is(tmp_path):
@@ -434,16 +388,12 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
         ("walker-walk", "low_spawn_fraction", "only for ant mazes"),
         ("cheetah-run", "path_reward_scale", "only for ant mazes"),
         ("cheetah-run", "shaping", "only for humanoid-walk and ant mazes"),
-        ("ant-maze-easy7x7b", "standing_starts", "only for bodies that move freely"),
-        ("cartpole-swingup", "standing_starts", "only for bodies that move freely"),
         ("fish-swim", "standing_starts", "only for bodies that move freely"),
     ],
 )
-@pytest.mark.parametrize("algorithm", ["sac", "mpo"])
-def test_a_setting_that_the_task_has_no_use_for_begins_no_run(tmp_path, task, setting, words, algorithm):
-    asked = config(task=task, algorithm=algorithm, settings={setting: 0.01})
+def test_a_setting_that_the_task_has_no_use_for_begins_no_run(tmp_path, task, setting, words):
     with pytest.raises(DmcvbError, match=f"setting {setting} is {words}.* remove it"):
-        open_run(tmp_path / "run", asked, False)
+        open_run(tmp_path / "run", config(task=task, settings={setting: 0.01}), False)
     assert not (tmp_path / "run").exists()
 
 

@@ -2,7 +2,7 @@
 
 from torch import nn
 
-from dmcvb_gen.agents.learners import Policy, adam, register_agent
+from dmcvb_gen.agents.learners import Policy, register_agent
 
 
 @register_agent("linear-bc")
@@ -15,7 +15,6 @@ class LinearBC(Policy):
         super().__init__()
         self.encoder, self.power = encoder.requires_grad_(not frozen), power
         self.policy = nn.Linear(encoder.features, sizes.action)
-        self.optimizers = {"main": adam([self])}
 
     def act(self, observation):
         return self.policy(self.encoder(observation)).clamp(-1, 1)
