@@ -17,6 +17,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import time
 import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -227,6 +228,7 @@ class CellRun:
         budget, cell, pixels = self.budget, self.cell, not self.cell.agent.sees_state
         encoder = cell.encoder and CellRun(self.root, self.out, budget, cell.encoder, self.tick)
         pretrained = encoder and encoder.result()
+        started = time.perf_counter()
         data = self.data(pixels, cell.agent.stack)
         torch.manual_seed(budget.seed)
         phi = make_encoder(cell.agent, data.sizes, budget.dino_weights, budget.network)
@@ -240,10 +242,10 @@ class CellRun:
         if budget.scores and not cell.agent.ready_encoder:  # DINO's weights are a large file of the user's
             trained.save(self.path(".safetensors"), budget.network)
         inspection = self.inspect(policy.encoder, data) if pixels and budget.readout_steps else None
-        looking = sum(points[-1]["seconds"] for points in inspection["curves"].values()) if inspection else 0.0
-        return self._facts(data, curve, looking) | {
+        return self._facts(data, curve) | {
             "pretraining": pretrained and {key: pretrained[key] for key in ("curve", "seconds", "action_probe")},
             "inspection": inspection,
+            "seconds": time.perf_counter() - started,
         }
 
     def _train_policy(self, policy: Policy, trained: TrainedAgent, data: TrainingData) -> Curve:
@@ -252,11 +254,22 @@ class CellRun:
         shift = budget.frozen_shift if frozen else budget.shifts(steps, len(data))
         if frozen:
             data = self._encoded(policy.encoder, data, steps * budget.batch_size)
-        with self._evaluator(trained.pixels, agent.stack) as evaluator:
+        evaluator = Evaluator(
+            self._subset,
+            pixels=trained.pixels,
+            stack=agent.stack,
+            episodes=budget.episodes,
+            max_steps=budget.episode_steps,
+            pair=goal_cells(self._subset, self.cell.policy[0].goal_pair),
+            backgrounds=budget.backgrounds,
+            threads=budget.threads,
+        )
+        with contextlib.closing(evaluator):
 
             def evaluate(_: Learner) -> dict[str, Any]:
                 score = evaluator.score(trained)
-                self._save_shots(score)
+                if score.pictures is not None:
+                    _save_sheet(self.path(".rollout.png"), [score.pictures])
                 return {"score": score.facts()}
 
             return self._fit(policy, data, steps, shift, f"{agent.name} on {self.cell.place}", evaluate=evaluate)
@@ -278,39 +291,14 @@ class CellRun:
         dtype = torch.bfloat16 if self.budget.precision == "bfloat16" else torch.float32
         return data.encoded(encoder, dtype, lambda share: self.tick(f"encoding, {share:.0%}", 0))
 
-    # -- evaluation
-
-    @contextlib.contextmanager
-    def _evaluator(self, pixels: bool, stack: int) -> Iterator[Evaluator]:
-        evaluator = Evaluator(
-            self._subset,
-            pixels=pixels,
-            stack=stack,
-            episodes=self.budget.episodes,
-            max_steps=self.budget.episode_steps,
-            pair=goal_cells(self._subset, self.cell.policy[0].goal_pair),
-            backgrounds=self.budget.backgrounds,
-            threads=self.budget.threads,
-        )
-        try:
-            yield evaluator
-        finally:
-            evaluator.close()
-
-    def _save_shots(self, score: Score) -> None:
-        if score.pictures is not None:
-            _save_sheet(self.path(".rollout.png"), [score.pictures])
-
-    def _facts(self, data: TrainingData, curve: Curve, looking: float) -> dict[str, Any]:
-        """The facts of a result, without encoder and inspection, which took so many seconds."""
+    def _facts(self, data: TrainingData, curve: Curve) -> dict[str, Any]:
+        """The facts of a result, without encoder, inspection and time."""
         cell, budget, subset = self.cell, self.budget, self._subset
         evaluations = [point for point in curve if "score" in point]
         best = max(evaluations, key=lambda point: point["score"]["mean"])
-        evaluating = sum(point["score"]["seconds"] for point in evaluations)
-        alike = (
-            best["score"]["limit"] == subset.record.max_steps
-        )  # returns of other lengths are not set beside the data's
-        normal = normalized(best["score"]["mean"], reference_returns(self.release, subset.record)) if alike else None
+        normal = None
+        if best["score"]["limit"] == subset.record.max_steps:  # returns of other lengths are not compared
+            normal = normalized(best["score"]["mean"], reference_returns(self.release, subset.record))
         paper = BENCHMARKS.get(cell.benchmark).paper_score(cell)
         return {
             "labels": {"policy": cell.policy_label, "encoder": cell.pretrain_label},
@@ -319,18 +307,11 @@ class CellRun:
             "evaluations": len(evaluations),
             "paper": paper and {"mean": paper[0], "stderr": paper[1]},
             "data": {key: value for key, value in data_score(subset, data).facts().items() if key != "returns"},
-            "digests": data_digests(self.release, cell),
             "episodes": len(data.lengths),
             "transitions": len(data),
             "evaluation": evaluation_of(self.release, budget, cell),
             "renderers": {"data": subset.record.renderer["name"], "evaluation": renderer_choice(subset)["name"]},
             "curve": [_thin(point) for point in curve],
-            "seconds": {
-                "training": curve[-1]["seconds"] - evaluating,
-                "evaluation": evaluating,
-                "inspection": looking,
-                "all": curve[-1]["seconds"] + looking,
-            },
             "machine": {"device": budget.device, "threads": budget.threads, "torch": torch.__version__},
             "generator": f"dmcvb-gen {__version__}",
         }
@@ -346,10 +327,10 @@ class CellRun:
             "state": StateProbe(encoder, data.sizes),
         }
         draws = len(readouts) * (steps * budget.batch_size + min(len(data.hold_out_rows), INSPECTED))
-        data, found = self._encoded(encoder, data, draws), dict[str, Any](curves={})
+        data, found = self._encoded(encoder, data, draws), dict[str, Any]()
         for name, learner in readouts.items():
             learner.to(budget.device)
-            found["curves"][name] = self._fit(learner, data, steps, budget.frozen_shift, f"{name} decoder")
+            self._fit(learner, data, steps, budget.frozen_shift, f"{name} decoder")
             self.tick("test errors of the decoders", 0)
             found[f"{name}_mse"] = test_error(learner, data, budget.batch_size)
         batch = draw(readouts["observation"], data, 8, budget.seed, 0, hold_out=len(data.hold_out_rows) > 0)

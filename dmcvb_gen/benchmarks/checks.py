@@ -1,4 +1,4 @@
-"""Check the structure of a release before any training, and what scores do not say after it.
+"""Check the structure of a release before any training, and whether scores are of distractors that were seen.
 
 `release.verify` looks at bytes, shapes, values, physics and sampled pixels; here it is asked first, and what only a
 benchmark cares about comes on top: returns as the policies and the paper promise, pictures that show something.
@@ -9,13 +9,12 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.plan import Cell
 from dmcvb_gen.dataset import Release, Subset
@@ -39,8 +38,6 @@ PICTURE_EPISODES = 100
 """Episodes of a subset whose every frame is looked at."""
 PAINTED_EPISODES = 8
 """The same, where its pictures are painted to be looked at."""
-STATE_BC_SHARE = 0.9
-"""Of the data's return (mazes: success) that BC(state) should reach on expert data; less draws a warning."""
 Results = Sequence[tuple[Cell, dict[str, Any]]]
 """Cells with their results."""
 
@@ -194,19 +191,7 @@ def _check_subset(subset: Subset, tick: ProgressCallback) -> tuple[list[Issue], 
     return [*check_policy_returns(subset), *found], [*odd, *check_paper_returns(subset)]
 
 
-# -- what scores do not say -------------------------------------------------------------------------
-
-
-def training_warnings(release: Release, budget: Budget, results: Results) -> Iterator[Issue]:
-    """List what makes the scores of cells say less than they seem to."""
-    cells = [cell for cell, _ in results]
-    yield from _seen_warnings(release, cells, budget.backgrounds)
-    if budget.scores:
-        found = [_learning_warning(budget, *each) for each in results]
-        yield from dict.fromkeys(issue for issue in found if issue)
-
-
-def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> Iterator[Issue]:
+def seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> Iterator[Issue]:
     """Evaluation shows what no data show (paper, section 5); data that were painted with it do not tell."""
     learned = dict.fromkeys(part.subset for cell in cells if not cell.agent.sees_state for part in cell.policy)
     for record in (release.subsets[name].record for name in learned):
@@ -218,20 +203,3 @@ def _seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | N
         if seen:
             text = f"painted with the {what} that evaluation shows: its scores are of distractors that were seen"
             yield Issue("learning", record.name, text)
-
-
-def _learning_warning(budget: Budget, cell: Cell, result: Mapping[str, Any]) -> Issue | None:
-    """Expert data that BC on states cannot learn from is odd."""
-    if "error" in result or cell.agent.name != "state-bc" or cell.policy_label != "expert":
-        return None
-    score, data = result["score"], result["data"]
-    if data["success"] is not None:
-        reached, wanted, what = 100 * score["success"], 100 * data["success"], "% of its goals, the data"
-    elif score["limit"] != data["limit"]:
-        return None  # returns of episodes that were cut elsewhere
-    else:
-        reached, wanted, what = score["mean"], data["mean"], "a return, the data"
-    if reached >= STATE_BC_SHARE * wanted:
-        return None
-    message = f"BC(state) reaches {reached:.0f} {what} {wanted:.0f} [{budget.name}]"
-    return Issue("learning", cell.policy[0].subset, message)

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import abc
 import copy
-import csv
-import functools
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -25,7 +22,7 @@ from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task
+from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task, read_table
 from dmcvb_gen.registry import Registry
 from dmcvb_gen.spec import (
     ANT_MAZE,
@@ -304,16 +301,6 @@ def goal_cells(subset: Subset, pair: int | None) -> tuple[tuple[int, int], tuple
 # -- the paper's scores -----------------------------------------------------------------------------
 
 
-@functools.cache
-def _paper_table() -> dict[tuple[str, str, str, str], tuple[float, float]]:
-    path = resources.files("dmcvb_gen.benchmarks") / "data" / "paper_benchmark1_locomotion.csv"
-    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
-    return {
-        (row["task"], row["level"], row["distractor"], row["agent"]): (float(row["mean"]), float(row["stderr"]))
-        for row in csv.DictReader(lines)
-    }
-
-
 def paper_score(task: str, level: str, setting: str, agent: str | None) -> tuple[float, float] | None:
     """(mean, standard error) of the published score of B1; None if the paper has none.
 
@@ -322,8 +309,9 @@ def paper_score(task: str, level: str, setting: str, agent: str | None) -> tuple
       setting: "none", "static" or "dynamic" at the paper's difficulty; BC(state) and data have one row for all.
       agent: a column of the paper's table, `Agent.paper_name`, or "data".
     """
-    table = _paper_table()
-    return table.get((task, level, setting, agent or "")) or table.get((task, level, "any", agent or ""))
+    table = read_table("dmcvb_gen.benchmarks", "paper_benchmark1_locomotion.csv", 4)
+    row = table.get((task, level, setting, agent or "")) or table.get((task, level, "any", agent or ""))
+    return row and (row["mean"], row["stderr"])
 
 
 # -- benchmarks -------------------------------------------------------------------------------------

@@ -311,10 +311,7 @@ def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
         rollouts=_sheets(good, folder, "rollout"),
         decoders=_sheets(good, folder, "decoder"),
         inspection=_inspection(good),
-        times=[
-            (result["id"], *(f"{result['seconds'][part]:.0f}" for part in ("training", "evaluation", "inspection")))
-            for result in facts["results"]
-        ],
+        times=[(result["id"], f"{result['seconds']:.0f}") for result in facts["results"]],
         seconds=facts["seconds"],
         settings=list(((facts["budget"] if facts["cells_planned"] else {}) | facts["versions"]).items()),
     )

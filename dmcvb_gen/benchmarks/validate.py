@@ -81,7 +81,7 @@ def validate(
     """
     asked = {name: value for name, value in locals().items() if name in TRAINING}
     from dmcvb_gen.benchmarks.cell import default_workers, kept_results, open_data, planned_steps, run_cells
-    from dmcvb_gen.benchmarks.checks import check_structure, training_warnings
+    from dmcvb_gen.benchmarks.checks import check_structure, seen_warnings
     from dmcvb_gen.benchmarks.report import Validation, claim_folder, plan_validation, report_facts, write_report
 
     started = time.perf_counter()
@@ -114,7 +114,7 @@ def validate(
     results.sort(key=lambda pair: cells.index(pair[0]))
     known = {cell for cell, _ in results}
     shown = [*results, *(kept for kept in kept_results(data, folder, budget) if kept[0] not in known)]
-    warnings = (*structure.warnings, *training_warnings(data, budget, shown))
+    warnings = (*structure.warnings, *seen_warnings(data, [cell for cell, _ in shown], budget.backgrounds))
     planned = dict.fromkeys([*cells, *(cell for cell, _ in shown)])
     facts = report_facts(chosen, budget, structure, len(planned), shown, missing, warnings)
     facts |= {"seconds": time.perf_counter() - started}

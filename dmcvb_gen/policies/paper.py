@@ -13,13 +13,17 @@ MAZE_GROUPS = {"empty": "ant-maze/empty", "easy": "ant-maze/single-obstacle", "m
 
 
 @functools.cache
-def _table() -> dict[tuple[str, str], dict[str, float]]:
-    path = resources.files("dmcvb_gen.policies") / "data" / "paper_episode_returns.csv"
-    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
-    return {
-        (row.pop("task"), row.pop("level")): {name: float(value) for name, value in row.items()}
-        for row in csv.DictReader(lines)
-    }
+def read_table(package: str, name: str, keys: int) -> dict[tuple[str, ...], dict[str, float]]:
+    """The rows of a table of the paper, by their first columns.
+
+    Args:
+      name: of a CSV file in the folder `data` of `package`; lines that begin with # are comments.
+      keys: number of the columns that name a row; the others are numbers.
+    """
+    text = (resources.files(package) / "data" / name).read_text()
+    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    places = [(tuple(row.values())[:keys], list(row.items())[keys:]) for row in rows]
+    return {place: {column: float(value) for column, value in values} for place, values in places}
 
 
 def paper_task(task_id: str) -> str:
@@ -32,7 +36,8 @@ def paper_task(task_id: str) -> str:
 
 def paper_returns(task_id: str, level: str) -> dict[str, float] | None:
     """Steps, mean, std, min, p25, median, p75, max of the paper's episode returns; None if it has no row."""
-    row = _table().get((paper_task(task_id), level))
+    table = read_table("dmcvb_gen.policies", "paper_episode_returns.csv", 2)
+    row = table.get((paper_task(task_id), level))
     return dict(row) if row else None
 
 

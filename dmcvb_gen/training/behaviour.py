@@ -252,8 +252,8 @@ def _train(run: "Run", done: int, progress: bool, notify: Callable[[str], None])
             bar.update(steps)
             last = now
 
-        def report(progress: Any) -> None:
+        def report(evaluation: Any) -> None:
             beside = f"/{expert['mean']:.0f}" if expert else ""
-            bar.set_postfix_str(f"return {progress.evaluation.mean:.0f}{beside}", refresh=False)
+            bar.set_postfix_str(f"return {evaluation.mean:.0f}{beside}", refresh=False)
 
         run.train(report, tick, lambda: notify("\nStopping: the run is being saved."))

@@ -35,6 +35,7 @@ import torch
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import remove_partial, sha256_file, write_bytes, write_json
+from dmcvb_gen.parallel import ignore
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import checkpoints
 from dmcvb_gen.policies.evaluation import evaluate
@@ -59,8 +60,7 @@ SAVE_SECONDS = 600
 """Seconds after which the state to resume from is saved again: a process that is killed loses these."""
 
 Weights = Mapping[str, torch.Tensor]
-Report = Callable[["Progress"], None]
-ProgressCallback = Callable[[int], Any]
+Report = Callable[[Evaluation], Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,15 +87,6 @@ class RunConfig:
     def init_name(self) -> str | None:
         """Return the last name of the path that a run starts from; the rest is private to the machine."""
         return self.init_from and Path(os.path.abspath(self.init_from)).name
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """One evaluation along the way, and the seconds of training until then, evaluations left out."""
-
-    step: int
-    evaluation: Evaluation
-    seconds: float
 
 
 class Stopped(DmcvbError):
@@ -198,8 +189,8 @@ class Run:
         self._began = self._last_saved = time.time()
         self._asked_to_stop = False
         self._log: RunLog | None = None
-        self._report: Report = lambda progress: None
-        self.tick: ProgressCallback = lambda steps: None
+        self._report: Report = ignore
+        self.tick: Callable[[int], Any] = ignore
 
     @property
     def begun(self) -> bool:
@@ -214,9 +205,9 @@ class Run:
 
     def train(
         self,
-        report: Report = lambda progress: None,
-        tick: ProgressCallback = lambda steps: None,
-        stopping: Callable[[], Any] = lambda: None,
+        report: Report = ignore,
+        tick: Callable[[int], Any] = ignore,
+        stopping: Callable[[], Any] = ignore,
     ) -> None:
         """Train until `config.steps` agent steps, or until Ctrl-C or SIGTERM, which save the run.
 
@@ -277,7 +268,7 @@ class Run:
         evaluation, _ = evaluate(policy, self.task, self.evaluation_episodes(), seed=self.step)
         self._write_checkpoint(policy, evaluation)
         self._log.add(self.step, evaluation, self.seconds, updates, metrics)
-        self._report(Progress(self.step, evaluation, self.seconds))
+        self._report(evaluation)
         self._began = time.time()
 
     def evaluation_episodes(self) -> int:

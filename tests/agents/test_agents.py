@@ -443,11 +443,6 @@ def test_bfloat16_changes_the_precision_and_not_the_meaning():
 # -- names ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", agent_names())
-def test_every_agents_name_is_read_back(name):
-    assert parse_agent(name).name == name
-
-
 def test_names_of_the_paper_and_options_are_understood():
     assert parse_agent("null+bc") == parse_agent("bc") and parse_agent("BC(state)").sees_state
     assert parse_agent("bc").paper_name == "null+bc" and parse_agent("state-bc").paper_name == "bc(state)"
@@ -506,11 +501,6 @@ def test_dino_gives_every_picture_of_a_stack_its_token_and_never_learns(dino_fil
     assert learner.act(observation).shape == (2, ACTIONS)
 
 
-def test_dino_without_weights_says_what_to_give():
-    with pytest.raises(DmcvbError, match="--dino-weights"):
-        DinoEncoder.load(None, channels=9)
-
-
 def test_a_file_that_is_no_dino_is_refused(tmp_path):
     save_file({"x": torch.zeros(1)}, str(tmp_path / "x.safetensors"))
     with pytest.raises(DmcvbError, match="does not hold"):
@@ -528,6 +518,7 @@ def test_every_agent_can_be_made_and_acts(name):
     from tests.agents.test_agents_data import make_data
 
     agent, data = parse_agent(name), make_data()
+    assert agent.name == name
     data = data.states_only() if agent.sees_state else data
     encoder = make_encoder(agent, data.sizes)
     if agent.pretrain:

@@ -118,15 +118,6 @@ def test_shifts_are_drawn_for_training_unless_left_out_and_not_for_the_hold_out(
 SHORT = Budget("short", batch_size=8, state_batch_size=8, evaluations=3)
 
 
-@pytest.mark.parametrize("shift", [True, False])
-def test_a_training_shifts_its_pictures_as_it_is_told(monkeypatch, shift):
-    data, asked = make_data(), []
-    batch = data.batch
-    monkeypatch.setattr(data, "batch", lambda *a, **k: asked.append((k["shift"], k["hold_out"])) or batch(*a, **k))
-    train(pixel_learner(data), data, SHORT, 3, shift=shift)
-    assert {told for told, held in asked if not held} == {shift}
-
-
 def test_states_are_normalized_by_the_training_episodes_with_a_floor():
     data = make_data()
     raw = torch.rand((16, 5), generator=torch.Generator().manual_seed(0))
@@ -205,12 +196,6 @@ def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small
     assert (len(two.lengths), len(two), len(two.hold_out_rows)) == (2, 1000, 0)  # a counted few are all learned from
     torch.testing.assert_close(again.action, two.action)
     assert not torch.equal(load_data(release, [Slice(name, **TWO)], seed=5).action, two.action)
-
-
-def test_states_alone_need_no_pictures(small_release):
-    data = load_data(Release.open(small_release), [Slice("walker-walk/random/none")], pixels=False)
-    batch = data.batch(4, np.random.default_rng(0), next_observation=True)
-    assert batch.observation.shape == (4, 24) and torch.equal(batch.observation, batch.state)
 
 
 def test_batches_drawn_ahead_come_in_order_and_are_the_same():

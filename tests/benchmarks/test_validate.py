@@ -26,13 +26,12 @@ from dmcvb_gen.benchmarks.checks import (
     check_pictures,
     check_policy_returns,
     check_structure,
-    training_warnings,
+    seen_warnings,
 )
 from dmcvb_gen.benchmarks.plan import BUDGETS, only, plan_benchmark
 from dmcvb_gen.benchmarks.report import (
     CHECKS,
     STATISTICS,
-    _inspection,
     curve_figures,
     render_page,
     render_tables,
@@ -197,25 +196,6 @@ def test_settings_that_share_trajectories_share_a_row_of_returns(report):
     ]  # fmt: skip
 
 
-def test_encoders_of_data_without_a_hold_out_have_no_row_of_errors(release):
-    cell = plan_benchmark("b1", Release.open(release), ["bc"])[0][0]
-    none, some = {"observation_mse": None, "state_mse": None}, {"observation_mse": 0.5, "state_mse": 1.0}
-    rows = _inspection([(cell, {"inspection": found}) for found in (none, some, None)])
-    assert rows == [("bc", "walker-walk/expert/dynamic", "0.5000", "1.0000")]
-
-
-@pytest.mark.slow
-def test_the_same_command_goes_on_where_it_stopped(report):
-    arguments, out, _ = report
-    files = sorted((out / "cells").glob("*.json"))
-    before = [file.stat().st_mtime_ns for file in files]
-    files[0].unlink()
-    facts = json.loads(run(*arguments, "--json").stdout)
-    after = [file.stat().st_mtime_ns for file in files]
-    assert len(facts["results"]) == 3
-    assert after[0] != before[0] and after[1:] == before[1:]
-
-
 def test_every_group_of_cells_has_a_figure_with_its_data_if_they_are_alike(release):
     cell = plan_benchmark("b1", Release.open(release), ["bc"])[0][0]
     point = {"step": 1, "loss": 1.0, "score": {"mean": 1.0, "stderr": 0.1}}
@@ -227,12 +207,6 @@ def test_every_group_of_cells_has_a_figure_with_its_data_if_they_are_alike(relea
     drawn = [figure.axes[1].get_lines() for figure in curve_figures(results, "smoke")]
     labels = [[line.get_label() for line in lines] for lines in drawn]
     assert ["data" in names for names in labels] == [True, False, False]  # only of like episodes
-
-
-@pytest.mark.parametrize("words", [("nowhere",), ("RELEASE", "--agents", "bcc")])
-def test_a_wrong_name_is_told_before_anything_else(small_release, words):
-    result = run("validate", *(small_release if word == "RELEASE" else word for word in words))
-    assert result.exit_code == 2 and result.output.count("\n") == 1 and "compute in" not in result.output
 
 
 @pytest.fixture(scope="module")
@@ -295,17 +269,6 @@ def test_a_release_that_grows_is_the_same_and_its_cells_are_made_again(scored, t
     assert agents_of(tmp_path / "out") == ["state-bc"]
     [result] = json.loads((tmp_path / "out" / "report.json").read_text())["results"]
     assert result["episodes"] == 2
-
-
-def test_a_damaged_release_is_reported_beside_the_scores_of_before(scored, small_release, tmp_path):
-    out, damaged = Path(shutil.copytree(scored.first, tmp_path / "out")), tmp_path / "damaged"
-    shutil.copytree(small_release, damaged)
-    rewrite(damaged, "walker-walk/random/none", set_rows("state", 1, (123, 4), np.nan))
-    result = scored(["state-td3-bc"], out, damaged)
-    assert not result.sound and not result.results
-    assert "Checks failed" in result.report.read_text()
-    scored(["state-bc"], out)  # of the sound one
-    assert agents_of(out) == ["state-bc"]
 
 
 def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
@@ -434,8 +397,7 @@ def test_black_pictures_fail_with_their_step_and_frozen_ones_are_a_warning(copy)
 
 def seen_in(release, cells):
     """Subsets that are warned of because their data show what evaluation shows."""
-    warnings = training_warnings(release, BUDGETS["smoke"], [(cell, {}) for cell in cells])
-    return {warning.subset for warning in warnings if "were seen" in warning.message}
+    return {warning.subset for warning in seen_warnings(release, cells, None)}
 
 
 def test_data_that_show_what_evaluation_shows_are_warned_of(tmp_path, small_release, maze_release):

@@ -20,14 +20,12 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from dmcvb_gen.cli import main
-from dmcvb_gen.cli.behaviours import _show_returns
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate import engine
-from dmcvb_gen.generate.returns import evaluate_behaviour
 from dmcvb_gen.own_code import BEHAVIOURS, allow, find_function
 from dmcvb_gen.own_code import TASKS as TASKS_VARIABLE
-from dmcvb_gen.policies.bundled import bundled_policies, level_files, resolve_policies
+from dmcvb_gen.policies.bundled import level_files, resolve_policies
 from dmcvb_gen.policies.convert import convert
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.release.card import write_card
@@ -475,13 +473,3 @@ def test_one_checkpoint_of_a_run_is_named_by_its_step(tmp_path, caplog):
 
 
 # -- returns --------------------------------------------------------------------------------------
-
-
-def test_random_actions_are_drawn_and_their_rows_say_so(capsys):
-    (file,) = bundled_policies(WALKER, "medium")
-    rows = evaluate_behaviour(behaviour=file, levels=["random", "medium"], episodes=2)
-    assert [(row["level"], row["mode"]) for row in rows] == [("random", "sampled"), ("medium", "mean")]
-    _show_returns(rows, 2, 1)
-    assert "2 episodes each, seed 1, mean actions" in capsys.readouterr().out
-    _show_returns(rows[:1], 2, 1)
-    assert "2 episodes each, seed 1, random actions" in capsys.readouterr().out

@@ -12,7 +12,7 @@ from safetensors.numpy import save
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies import archives
-from dmcvb_gen.policies.archives import bundled_digests, bundled_file, pack, pack_files
+from dmcvb_gen.policies.archives import bundled_digests, bundled_file, pack
 from dmcvb_gen.policies.bundled import bundled_levels, bundled_names
 from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze
@@ -88,10 +88,3 @@ def test_packed_files_come_out_as_they_were_and_other_tasks_keep_theirs(tmp_path
         assert {name: bundled_file(name).read_bytes() for name in bundled_digests()} == contents | swapped
     finally:
         bundled_digests.cache_clear()
-
-
-def test_what_files_share_is_packed_once():
-    def size(*seeds):
-        return len(pack_files({str(place): policy(seed) for place, seed in enumerate(seeds)}))
-
-    assert size(1, 1) - size(1) < 400

@@ -114,11 +114,6 @@ def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
     assert drawn["mode"] == "sampled" and drawn["returns"] != row["returns"]
 
 
-def test_a_folder_without_picks_says_what_to_run(tmp_path):
-    result = CliRunner().invoke(main, ["evaluate-behaviour", "--behaviour", str(tmp_path)])
-    assert result.exit_code == 2 and "select-checkpoints" in result.output
-
-
 @pytest.mark.slow
 def test_a_task_without_a_setting_of_its_own_goes_from_nothing_to_data(tmp_path):
     words = [f"--set={pair}" for pair in ("warmup_steps=24", "simulations=4", "batch_size=16", "compile=false")]
