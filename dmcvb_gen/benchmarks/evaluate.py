@@ -10,6 +10,7 @@ an agent has 1,000 steps (`Task.evaluation_steps`), where the authors' evaluatio
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import math
@@ -397,44 +398,32 @@ def evaluate(
       DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave their
         bounds, or observations of another kind than the policy's.
     """
-    stack = _own_value(policy, "stack", stack, 3)
-    pixels = _own_value(policy, "pixels", pixels, True)
-    seen = getattr(policy, "evaluation", {}) or {}
-    drawn = seen.get("renderer") or {"name": NATIVE, "samples": None}
-    if renderer in (None, drawn["name"]):
-        samples = drawn["samples"] if samples is None else samples
+    stack, pixels = _own_value(policy, "stack", stack, 3), _own_value(policy, "pixels", pixels, True)
+    seen = getattr(policy, "evaluation", None) or {}
     if isinstance(where, Subset):
-        _own_value(policy, "picture_size", where.record.size if pixels and size is None else size, 0)
-        own = dict(size=size, renderer=renderer, samples=samples, action_repeat=action_repeat)
-        scene = _scene_of(where, **own, backgrounds=backgrounds, split=split)
+        if where.record.goal_mode is GoalMode.FIXED:
+            raise DmcvbError(f"{where.name} has fixed goals; score policies on them by `validate --benchmark b3`")
+        scene = EvaluationScene.of(where, None if backgrounds == EvaluationScene.backgrounds else backgrounds)
+        _own_value(policy, "picture_size", scene.size if pixels and size is None else size, 0)
         max_steps = min(max_steps or MAX_STEPS, where.record.max_steps)
     else:
-        repeat = action_repeat or seen.get("action_repeat", ACTION_REPEAT)
-        shown: dict[str, Any] = dict(backgrounds=backgrounds, split=split, action_repeat=repeat)
-        shown |= dict(renderer=renderer or drawn["name"], samples=samples)
+        drawn = seen.get("renderer") or {"name": NATIVE, "samples": None}
         size = _own_value(policy, "picture_size", size, 64) if pixels else 64
-        scene = EvaluationScene.parse(where, size=size, **shown)
+        repeat = seen.get("action_repeat", ACTION_REPEAT)
+        shown: dict[str, Any] = dict(renderer=drawn["name"], samples=drawn["samples"], action_repeat=repeat)
+        scene = EvaluationScene.parse(where, backgrounds=backgrounds, size=size, **shown)
+    if renderer not in (None, scene.renderer):
+        scene = replace(scene, renderer=renderer, samples=None)
+    given = dict(size=size, samples=samples, action_repeat=action_repeat, split=split)
+    scene = replace(scene, **{name: value for name, value in given.items() if value is not None})
     limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
-    evaluator = Evaluator(scene, pixels=pixels, stack=stack, **limits)
-    try:
+    with contextlib.closing(Evaluator(scene, pixels=pixels, stack=stack, **limits)) as evaluator:
         if pixels and seen:
             _tell_differences(scene, evaluator, seen)
         score = evaluator.score(policy)
-    finally:
-        evaluator.close()
     if isinstance(where, Subset) and score.limit == where.record.max_steps:
         return replace(score, normalized=normalized(score.mean, reference_returns(where.release, where.record)))
     return score
-
-
-def _scene_of(subset: Subset, **given: Any) -> EvaluationScene:
-    """The scene of a subset, with what is given instead."""
-    if subset.record.goal_mode is GoalMode.FIXED:
-        raise DmcvbError(f"{subset.name} has fixed goals; score policies on them by `validate --benchmark b3`")
-    if given["backgrounds"] == EvaluationScene.backgrounds:
-        given["backgrounds"] = None
-    own = EvaluationScene.of(subset, given["backgrounds"])
-    return replace(own, **{name: value for name, value in given.items() if value is not None})
 
 
 def _own_value(policy: Act, name: str, given: Any, usual: Any) -> Any:

@@ -221,23 +221,20 @@ class Run:
           DmcvbError: another process trains in the folder, or its disk is full (the last saved state is whole).
         """
         self._report, self.tick = report, tick
-        with self._writing():
-            for name in ("checkpoints", "resume"):
-                (self.folder / name).mkdir(parents=True, exist_ok=True)
-            with self._alone():
-                self.write_config()
-                saved = self.saved()
-                if not saved and checkpoints(self.folder):
-                    raise DmcvbError(
-                        f"{self.folder} has checkpoints, but nothing to resume from (resume/{STATE} is gone); choose "
-                        "another --out"
-                    )
-                self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
-                self._drop_later_checkpoints()
-                self._log = RunLog(self.folder, self.step)
-                self._began = self._last_saved = time.time()
-                with self._stopping_on_signals(stopping):
-                    self.algorithm.train(self)
+        with self._alone():
+            self.write_config()
+            saved = self.saved()
+            if not saved and checkpoints(self.folder):
+                raise DmcvbError(
+                    f"{self.folder} has checkpoints, but nothing to resume from (resume/{STATE} is gone); choose "
+                    "another --out"
+                )
+            self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
+            self._drop_later_checkpoints()
+            self._log = RunLog(self.folder, self.step)
+            self._began = self._last_saved = time.time()
+            with self._stopping_on_signals(stopping):
+                self.algorithm.train(self)
 
     def write_config(self) -> None:
         """Write run.json."""
@@ -324,20 +321,13 @@ class Run:
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
         """One process a folder; the lock ends with the process, however that ends."""
-        lock = filelock.FileLock(self.folder / "resume" / "lock", timeout=0)
         try:
-            lock.acquire()
+            for name in ("checkpoints", "resume"):
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+            with filelock.FileLock(self.folder / "resume" / "lock", timeout=0):
+                yield
         except filelock.Timeout:
             raise DmcvbError(f"another process trains in {self.folder}; wait for it, or choose another --out") from None
-        try:
-            yield
-        finally:
-            lock.release()
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
         except OSError as error:
             raise DmcvbError(
                 f"cannot write the run in {self.folder}: {error.strerror or error}; the previous saved state is whole, "
