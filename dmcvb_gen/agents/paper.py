@@ -11,15 +11,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from dmcvb_gen.agents.data import Sizes
-from dmcvb_gen.agents.learners import (
-    EMA_DECAY,
-    Batch,
-    Learner,
-    Policy,
-    frozen_copy,
-    move_towards,
-    register_agent,
-)
+from dmcvb_gen.agents.learners import EMA_DECAY, Batch, Learner, Policy, frozen_copy, move_towards, register_agent
 from dmcvb_gen.agents.networks import (
     LATENT,
     MLP,

@@ -21,6 +21,8 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from dmcvb_gen.agents.data import Slice, load_data
+from dmcvb_gen.benchmarks.cell import data_score
 from dmcvb_gen.benchmarks.checks import (
     check_paper_returns,
     check_pictures,
@@ -28,21 +30,17 @@ from dmcvb_gen.benchmarks.checks import (
     check_structure,
     seen_warnings,
 )
-from dmcvb_gen.benchmarks.plan import BUDGETS, only, plan_benchmark
-from dmcvb_gen.benchmarks.report import (
-    CHECKS,
-    STATISTICS,
-    curve_figures,
-    render_page,
-    render_tables,
-)
+from dmcvb_gen.benchmarks.plan import BUDGETS, goal_cells, only, plan_benchmark
+from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, curve_figures, render_page, render_tables
 from dmcvb_gen.benchmarks.validate import validate
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.dataset.manifest import record_path
+from dmcvb_gen.dataset.manifest import PolicyRecord, record_path
 from dmcvb_gen.errors import DmcvbError
-from tests.conftest import maze_recipe, rewrite, roll_out, small_recipe
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import fixed_pairs
+from tests.conftest import TINY_MAZE, maze_recipe, rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/expert/dynamic"
 
@@ -467,3 +465,75 @@ def test_a_stopped_validation_takes_its_workers_with_it(small_release, tmp_path)
     while any(Path(f"/proc/{pid}").exists() for pid in started) and time.time() < deadline:
         time.sleep(0.1)
     assert not any(Path(f"/proc/{pid}").exists() for pid in started)
+
+
+# -- mazes: goals visible, hidden, fixed ------------------------------------------------------------
+
+MAZE = "ant-maze-tiny/random"
+
+
+def test_episodes_of_fixed_goals_are_not_held_to_returns_over_random_ones(small_mazes):
+    said = {"mean": -1.0, "std": 0.1, "episodes": 100, "mode": "sampled"}
+    policy = PolicyRecord(name="other", digest="x", header={"task": TINY_MAZE, "evaluation": said})
+    found = {}
+    for setting in ("visible", "fixed"):
+        subset = Release.open(small_mazes)[f"{MAZE}/{setting}"]
+        whole = {"policies": (policy,), "deterministic": False, "max_steps": get_task(TINY_MAZE).max_steps}
+        subset.record = subset.record.model_copy(update=whole)
+        found[setting] = len(list(check_policy_returns(subset)))
+    assert found == {"visible": 1, "fixed": 0}
+
+
+def test_the_cells_of_a_goal_pair_are_those_of_the_rollout(small_mazes):
+    subset, layout = Release.open(small_mazes)[f"{MAZE}/fixed"], get_task(TINY_MAZE).layout
+    assert [goal_cells(subset, pair) for pair in range(2)] == fixed_pairs(layout, 2, seed=3)
+
+
+# -- B1 and B3 ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def maze_report(small_mazes, tmp_path_factory):
+    out = tmp_path_factory.mktemp("maze-report")
+    command = ["validate", str(small_mazes), "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
+    return out, CliRunner().invoke(main, [*command, "--workers", "1", "--threads", "1", "--out", str(out)])
+
+
+def test_a_maze_release_goes_through_b1_and_b3(maze_report):
+    out, result = maze_report
+    assert result.exit_code == 0, result.output
+    facts = json.loads((out / "report.json").read_text())
+    ran = [(r["cell"]["benchmark"], r["cell"]["agent"], r["labels"]["policy"]) for r in facts["results"]]
+    assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | {
+        ("b3", agent, f"random goal {pair}") for agent in ("bc", "id+bc") for pair in range(2)
+    }
+    by_id = {r["id"]: r for r in facts["results"]}
+    pretrained = next(r for name, r in by_id.items() if name.startswith("b3") and "id-bc" in name.replace("+", "-"))
+    assert [part["subset"] for part in pretrained["cell"]["pretrain"]] == [f"{MAZE}/hidden"]
+    assert not facts["failed"] and not any(r["share"] for r in facts["results"])
+    assert "ant-maze-tiny/expert/visible" in result.output  # B1 would have the paper's levels too
+
+
+def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(small_mazes):
+    subset, task = Release.open(small_mazes)[f"{MAZE}/visible"], get_task(TINY_MAZE)
+    data = load_data({subset.name: subset}, [Slice(subset.name)], pixels=False, seed=0)
+    first, ends = np.cumsum(data.lengths + 1) - data.lengths - 1, np.cumsum(data.lengths + 1) - 1
+    data.discount[ends - 1] = 0  # as if the ant had got there
+    state = data.state[first].numpy() * data.normalization.std.numpy() + data.normalization.mean.numpy()
+    assert state == pytest.approx(subset.read("state")[:, 0], abs=1e-4)
+    straight = np.linalg.norm(subset.read("state")[:, 0, task.state_slices["target_vector"]], axis=1)
+    score = data_score(subset, data)
+    assert score.success == 1
+    assert score.speed == pytest.approx((straight / (data.lengths * 2 * task.control_timestep)).mean(), rel=1e-4)
+
+
+def test_maze_scores_have_reward_success_and_speed_beside_the_datas_own(maze_report, small_mazes):
+    facts = json.loads((maze_report[0] / "report.json").read_text())
+    [score] = [r for r in facts["results"] if r["cell"]["agent"] == "state-bc"]
+    subset = Release.open(small_mazes)[f"{MAZE}/visible"]
+    reached = subset.read("terminated")
+    assert score["data"]["success"] == reached.mean() and score["data"]["limit"] == subset.record.max_steps
+    assert (score["data"]["speed"] is None) == (not reached.any())
+    assert score["score"]["success"] is not None and score["score"]["limit"] == 10  # smoke's
+    page = (maze_report[0] / "report.html").read_text()
+    assert "success" in page and "Evaluations are cut at 10 agent steps" in page
