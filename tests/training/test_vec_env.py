@@ -8,7 +8,6 @@ import pytest
 from dm_control import suite
 
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.base import PHYSICS_SPEC
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
 
@@ -20,12 +19,12 @@ def test_steps_agree_with_dm_control(task_id):
     peer.reset()
     env.reset()
     data = mujoco.MjData(task.model)
-    mujoco.mj_setState(task.model, data, env.episodes._batch.physics()[1], PHYSICS_SPEC)
+    mujoco.mj_setState(task.model, data, env.episodes._batch.physics()[1], task.physics_spec)
     with peer.physics.reset_context():
         peer.physics.data.qpos[:], peer.physics.data.qvel[:] = data.qpos, data.qvel
     peer.physics.data.act[:], peer.physics.data.qacc_warmstart[:] = data.act, data.qacc_warmstart
     rng = np.random.default_rng(0)
-    for _ in range(60):
+    for _ in range(20):
         actions = rng.uniform(task.action_low, task.action_high, (2, task.action_size)).astype(np.float32)
         _, reward, _, _ = env.step(actions)
         assert reward[1] == pytest.approx(sum(peer.step(actions[1]).reward for _ in range(2)), abs=1e-4)
