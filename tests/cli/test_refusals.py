@@ -112,7 +112,6 @@ OTHERS = [
     ("validate r --agents state-bc,bc --dino-weights x", "add --agents dino+bc"),
     ("validate r --benchmark b9", "unknown benchmark 'b9'"),
     ("validate r --benchmark b3", "has no data"),
-    ("validate r --agent nowhere:x", "cannot find agent nowhere:x"),
     ("validate r --only foo*", "unknown subset pattern 'foo*'"),
 ]
 
