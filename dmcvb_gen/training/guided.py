@@ -161,6 +161,7 @@ class Student:
             "buffer": self.buffer.state(),
             "owed": self.owed,
             "updates": self.updates,
+            "loss": self.loss,
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -170,7 +171,7 @@ class Student:
         for rng, saved in zip((self.rng, *self.noise), json.loads(state["rng"]), strict=True):
             rng.bit_generator.state = saved
         self.buffer.load_state(state["buffer"])
-        self.owed, self.updates = state["owed"], state["updates"]
+        self.owed, self.updates, self.loss = state["owed"], state["updates"], state["loss"]
 
 
 def base_policy(run: Run) -> Policy:
