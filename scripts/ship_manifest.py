@@ -13,6 +13,7 @@ from pathlib import Path
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import MANIFEST, RECIPES
 from dmcvb_gen.generate.shipped import ENDING, pack
+from dmcvb_gen.release.tree import list_files
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,7 +33,8 @@ for folder in parser.parse_args().releases:
     card = ROOT / "dataset_cards" / name
     card.mkdir(exist_ok=True)
     with tarfile.open(card / "files.tar.xz", "w:xz", preset=9) as archive:
-        for path in (MANIFEST, *(f"{RECIPES}{recipe.sha256}.json" for recipe in release.recipes), *release.lists()):
+        recipes = (f"{RECIPES}{recipe.sha256}.json" for recipe in release.recipes)
+        for path in (MANIFEST, *recipes, *(file.path for file in list_files(release, release.layers))):
             archive.add(folder / path, path, filter=bare)
     size = pack(release, ROOT / f"dmcvb_gen/generate/data/manifests/{name}{ENDING}")
     beside = (card / "files.tar.xz").stat().st_size

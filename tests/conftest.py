@@ -19,6 +19,7 @@ from dmcvb_gen.dataset.writer import finish, put_shard  # noqa: E402
 from dmcvb_gen.generate.executors import run_works  # noqa: E402
 from dmcvb_gen.generate.plan import make_plan, start  # noqa: E402
 from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
+from dmcvb_gen.release.verify import verify_folder  # noqa: E402
 from dmcvb_gen.rendering.native import textures  # noqa: E402
 
 pytest_plugins = ["tests.compiled_code", "tests.tiers"]
@@ -107,6 +108,11 @@ def invoke(*words, code=None):
     result = CliRunner().invoke(main, [str(word) for word in words])
     assert code in (None, result.exit_code), result.output
     return result
+
+
+def wrong_files(folder):
+    """What `verify` says of the files of a release in a folder, without a look at their values."""
+    return verify_folder(folder, names=()).findings
 
 
 def records(release):

@@ -1,15 +1,15 @@
 """Hostile files are refused in a line or do no harm: no program runs, nothing is written outside, memory is bounded.
 
-A few dozen of each kind here; `python -m tests.faults.hostile --examples 500 --seed 7` gives five hundred others.
+A few dozen of each kind here; `HOSTILE=500 pytest tests/test_hostile_inputs.py` takes five hundred.
 """
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from tests.faults.hostile import KINDS, Taker, run_kind
-
-EXAMPLES = 25
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +21,5 @@ def taker():
 @pytest.mark.slow_cases("manifest")
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_files_are_refused_in_a_line_or_do_no_harm(taker, kind):
-    outcome = run_kind(taker, kind, EXAMPLES)
-    assert not outcome.wrong, "\n\n".join(outcome.wrong.values())
-    assert outcome.refused + outcome.accepted > 0
+    wrong = run_kind(taker, kind, int(os.environ.get("HOSTILE", "25")))
+    assert not wrong, "\n\n".join(wrong.values())

@@ -39,7 +39,7 @@ def fetch(as_json, **options):
 
     \b
     dmcvb-gen fetch s3://bucket/mini --only 'walker-walk/*' --out data/mini
-    dmcvb-gen fetch s3://bucket/light --paint --size 84 --out data/mini84
+    dmcvb-gen fetch s3://bucket/light --paint --out data/light
     """
     moved, done = download(options, notify=_tell)
     out = options["out"]

@@ -12,13 +12,9 @@ from dmcvb_gen.version import __version__
 PACKAGES = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "zarr", "numcodecs")
 
 
+@functools.cache
 def environment() -> dict[str, str]:
     """Versions and processor of this process."""
-    return dict(_environment())
-
-
-@functools.cache
-def _environment() -> dict[str, str]:
     versions = {name: version for name in PACKAGES if (version := _version(name))}
     return {
         "dmcvb-gen": __version__,

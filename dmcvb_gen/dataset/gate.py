@@ -33,6 +33,7 @@ from dmcvb_gen.dataset.manifest import (
     Resolved,
     ShardRecord,
     SubsetRecord,
+    canonical_json,
     check_record,
     layer_order,
     list_bytes_limit,
@@ -79,11 +80,13 @@ class Shard:
     @property
     def files(self) -> tuple[FileRecord, ...]:
         """Its data files, with their paths in the release."""
-        specs = {spec.name: spec for spec in self.layer.arrays}
-        return tuple(
-            FileRecord(path=self.layer.file_path(specs[name], self.number), bytes=file.bytes, sha256=file.sha256)
-            for name, file in sorted(self.record.files.items())
-        )
+        paths = {spec.name: self.layer.file_path(spec, self.number) for spec in self.layer.arrays}
+        return tuple(file.at(paths[name]) for name, file in sorted(self.record.files.items()))
+
+    @property
+    def record_file(self) -> FileRecord:
+        """The file that its record is in."""
+        return FileRecord.of(self.record_path, canonical_json(self.record))
 
 
 class Release:
@@ -231,17 +234,28 @@ class Release:
     def here(self, layer: str) -> Collection[int]:
         """Numbers of the shards of a layer that are here: all, but in a copy those whose record is."""
         if layer not in self._here:
-            if self.copy is None:
-                self._here[layer] = frozenset(self.records(layer))
-            else:
-                self._here[layer] = self._copied(layer)
+            try:
+                self._here[layer] = recorded_shards(self.store, layer) if self.copy else frozenset(self.records(layer))
+            except StoreError:  # a web server gives no lists
+                if self.copy is None:
+                    raise
+                self._here[layer] = self.copy.shards(layer)
         return self._here[layer]
 
-    def _copied(self, layer: str) -> Collection[int]:
+    def layer_shards(self, name: str) -> tuple[Shard, ...]:
+        """The shards of a layer that exist, in order; none of a layer of which a part of a release has nothing.
+
+        Raises:
+          StoreError: the list is missing or altered, or a record is another job's.
+        """
+        layer, here = self.layers[name], self.here(name)
         try:
-            return recorded_shards(self.store, layer)
-        except StoreError:  # a web server gives no lists
-            return self.copy.shards(layer) if self.copy else ()
+            records = self.records(name)
+        except NotThere:
+            if self.copy is None or here:
+                raise
+            return ()  # a part has the lists of its own layers
+        return tuple(Shard(layer, number, record, number in here) for number, record in sorted(records.items()))
 
     def shards(
         self, names: Collection[str] = (), episodes: tuple[int, int] | None = None, images: bool = True
@@ -261,26 +275,12 @@ class Release:
                 layer = self.layers[name]
                 if layer.kind == "images" and not (images or layer.source):
                     continue
-                here = self.here(name)
-                try:
-                    records = self.records(name)
-                except NotThere:
-                    if self.copy is None or here:
-                        raise
-                    continue  # a part has the lists of its own layers
-                for number in sorted(records):
-                    span = layer.episodes_of(number)
-                    wanted = span.start < subset.episodes and (
-                        episodes is None or (span.start < episodes[1] and episodes[0] < span.stop)
-                    )
-                    if wanted and (name, number) not in done:
-                        done.add((name, number))
-                        yield Shard(layer, number, records[number], number in here)
-
-    def lists(self, layers: Collection[str] | None = None) -> tuple[str, ...]:
-        """Paths of the lists of layers, all by default; none of a release in the making."""
-        chosen = self.manifest.layers if layers is None else [self.layers[name] for name in layers]
-        return tuple(dict.fromkeys(list_path(layer.list) for layer in chosen if isinstance(layer, ListedLayer)))
+                for shard in self.layer_shards(name):
+                    span, place = shard.episodes, (name, shard.number)
+                    first, last = episodes or (0, subset.episodes)
+                    if span.start < min(last, subset.episodes) and first < span.stop and place not in done:
+                        done.add(place)
+                        yield shard
 
     def inputs_of(self, names: Collection[str]) -> tuple[FileRecord, ...]:
         """Policies and videos of some subsets, of which the release keeps copies."""

@@ -42,33 +42,17 @@ MAX_CHUNK_BYTES, MAX_SHARD_BYTES = 2**31, 2**37
 """More than any release has; a manifest that asks for more is damaged or hostile."""
 PLAIN_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$"
 """A part of a path that leads nowhere else; exports make folders and files of versions and views."""
-_PART = re.compile(PLAIN_NAME.strip("^$"))
+_PART = PLAIN_NAME.strip("^$")
 IMPORTED = "imported"
 """Name of the renderer of subsets that came from DMC-VB's published data."""
 Kind = Literal["trajectories", "labels", "images"]
 Codec = Literal["zstd", "channel-delta-zstd"]
 
 
-def check_relative_path(path: str) -> str:
-    """Return `path` if it is a plain relative path that stays inside its folder.
-
-    Raises:
-      ValueError: it is absolute, climbs out, or holds an odd character.
-    """
-    if len(path) > 1000 or not all(_PART.fullmatch(part) for part in path.split("/")):
-        raise ValueError(f"{path[:80]!r} is not a plain relative path")
-    return path
-
-
-def _check_line(text: str) -> str:
-    if any(ord(char) < 32 or 127 <= ord(char) < 160 for char in text):
-        raise ValueError("it holds control characters")
-    return text
-
-
-RelativePath = Annotated[str, pydantic.AfterValidator(check_relative_path)]
+RelativePath = Annotated[str, pydantic.StringConstraints(pattern=f"^{_PART}(/{_PART})*$", max_length=1000)]
+"""A path that stays inside its folder, without odd characters."""
 Digest = Annotated[str, pydantic.StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-Line = Annotated[str, pydantic.StringConstraints(max_length=1000), pydantic.AfterValidator(_check_line)]
+Line = Annotated[str, pydantic.StringConstraints(pattern=r"^[^\x00-\x1f\x7f-\x9f]*$", max_length=1000)]
 PlainName = Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME, max_length=200)]
 
 
@@ -82,6 +66,11 @@ class FileRecord(_Model):
     path: RelativePath
     bytes: int = pydantic.Field(ge=0)
     sha256: Digest
+
+    @classmethod
+    def of(cls, path: str, data: bytes) -> FileRecord:
+        """The record of a file with these bytes."""
+        return cls(path=path, bytes=len(data), sha256=sha256_bytes(data))
 
 
 # -- layers and their records ---------------------------------------------------------------------
@@ -187,6 +176,10 @@ class ShardFile(_Model):
 
     bytes: int = pydantic.Field(gt=0, le=MAX_SHARD_BYTES)
     sha256: Digest
+
+    def at(self, path: str) -> FileRecord:
+        """The same file at its path in the release."""
+        return FileRecord(path=path, bytes=self.bytes, sha256=self.sha256)
 
 
 class ShardRecord(_Model):
@@ -325,6 +318,10 @@ def _check_tree(subsets: tuple[SubsetRecord, ...], layers: Iterable[Layer]) -> N
             raise ValueError(f"the first layer of {subset.name} holds no trajectories")
 
 
+SAID = ("name", "version", "license", "authors", "description")
+"""What a recipe and a manifest say of a release for people."""
+
+
 class _Described(_Model):
     """What recipes and manifests share."""
 
@@ -336,6 +333,11 @@ class _Described(_Model):
     description: str = pydantic.Field(default="", max_length=10_000)
     inputs: tuple[FileRecord, ...] = pydantic.Field(default=(), max_length=10**6)
     subsets: tuple[SubsetRecord, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+    @property
+    def imported(self) -> bool:
+        """True if any of its subsets was imported, see `SubsetRecord.imported`."""
+        return any(record.imported for record in self.subsets)
 
 
 class Resolved(_Described):
@@ -386,11 +388,6 @@ class Manifest(_Described):
         if sum(layer.shards for layer in self.layers) > 10 * MAX_SHARDS:
             raise ValueError(f"it has more shards than the {10 * MAX_SHARDS:,} that a release may have")
         return self
-
-    @property
-    def imported(self) -> bool:
-        """True if any of its subsets was imported, see `SubsetRecord.imported`."""
-        return any(record.imported for record in self.subsets)
 
 
 class Copy(_Model):
@@ -468,8 +465,7 @@ def is_attachment(path: str) -> bool:
 
 def list_bytes_limit(layer: ListedLayer) -> int:
     """The largest list that a layer can have."""
-    names = sum(len(spec.name) + 130 for spec in layer.arrays)
-    return 1000 + layer.shards * (200 + names)
+    return 1000 + layer.shards * record_bytes_limit(layer)
 
 
 def record_bytes_limit(layer: Layer) -> int:
@@ -516,23 +512,17 @@ def _difference(one: Layer, other: Layer) -> str:
     keys, fields = sorted({*one.makes, *other.makes}), ("episodes_per_shard", "rows", "group", "kind", "source")
     pairs = {key: (one.makes.get(key), other.makes.get(key)) for key in keys}
     pairs |= {name: (getattr(one, name), getattr(other, name)) for name in fields}
-    different = ((name, *pair) for name, pair in pairs.items() if pair[0] != pair[1])
-    if (found := next(different, None)) is None:
-        return f"{one.name} has {_arrays(one, other)}, asked for {_arrays(other, one)}; {_cure(other)}"
-    field, first, second = found
-    return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+    pairs["arrays"] = (_arrays(one, other), _arrays(other, one))
+    field, first, second = next((name, *pair) for name, pair in pairs.items() if pair[0] != pair[1])
+    images = field == "arrays" and other.kind == "images"
+    paint = f"add these images with `paint --size {other.arrays[0].shape[0]}`, or " if images else ""
+    return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; {paint}choose another --out"
 
 
 def _arrays(one: Layer, other: Layer) -> str:
     """The arrays of a layer that another one lacks or has in another form."""
     mine = [spec for spec in one.arrays if spec not in other.arrays]
     return ", ".join(f"{spec.name} of {spec.dtype} {list(spec.shape)}" for spec in mine) or "no others"
-
-
-def _cure(layer: Layer) -> str:
-    shape = layer.arrays[0].shape
-    paint = f"add these images with `paint --size {shape[0]}`, or " if layer.kind == "images" and shape else ""
-    return f"{paint}choose another --out"
 
 
 def _short(value: Any) -> str:
@@ -570,11 +560,7 @@ def build_manifest(
     newest = max(used, key=lambda recipe: (_version_key(recipe.version), recipe.name, recipe.sha256))
     inputs = {file.path: file for recipe in used for file in recipe.inputs}
     manifest = Manifest(
-        name=newest.name,
-        version=newest.version,
-        license=newest.license,
-        authors=newest.authors,
-        description=newest.description,
+        **{name: getattr(newest, name) for name in SAID},
         recipes=tuple(recipe.sha256 for recipe in used),
         inputs=tuple(inputs[path] for path in sorted(inputs)),
         layers=tuple(
@@ -604,15 +590,7 @@ def _without_needless(whole: Iterable[tuple[Resolved, SubsetRecord]]) -> list[Re
 
 def _described(recipe: Resolved) -> tuple[Any, ...]:
     """What must be equal for one recipe to stand for another; one that `paint` made names no policies."""
-    return (
-        bool(recipe.recipe),
-        recipe.name,
-        recipe.version,
-        recipe.license,
-        recipe.authors,
-        recipe.description,
-        recipe.derived,
-    )
+    return bool(recipe.recipe), recipe.derived, *(getattr(recipe, name) for name in SAID)
 
 
 def _facts(layer: Layer) -> dict[str, Any]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any, cast
 
 import numpy as np
 import zarr
 
-from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ShardFile, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset.manifest import ArraySpec, Layer, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
@@ -59,30 +59,17 @@ class StoredArray:
         Raises:
           IndexError: the index does not fit the array.
         """
-        parts = self._index(selection)
-        self._check_here(parts[0])
-        with storage_errors(self._place, decoding=True):
-            lists = any(isinstance(part, np.ndarray) for part in parts)
-            return cast(np.ndarray, self._array.oindex[parts] if lists else self._array[parts])
+        return self.outer(self._index(selection))
 
     def _index(self, selection: Any) -> tuple:
         """The index as Zarr takes it, looked at before anything is read: what fails then is damaged."""
         parts = without_ellipsis(selection, self.ndim)
-        if len(parts) > self.ndim:
-            raise IndexError(f"{len(parts)} indices are too many for {self!r}")
-        found = []
-        for axis, part in enumerate(parts):
-            try:
-                chosen = np.arange(self.shape[axis])[part]
-            except IndexError as error:
-                raise IndexError(f"axis {axis} of {self!r}: {error}") from None
-            if chosen.ndim > 1:
-                raise IndexError(f"axis {axis} of {self!r}: give a number, a slice, or a list of numbers")
-            steps_back = isinstance(part, slice) and (part.step or 1) < 0  # Zarr knows no such slices, nor masks
-            found.append(part if isinstance(part, slice) and not steps_back else chosen)
-        if sum(isinstance(part, np.ndarray) for part in found) > 1:
-            raise IndexError(f"{self!r}: give a list along one axis alone, or see outer()")
-        return tuple(found)
+        found = [np.arange(size)[part] for size, part in zip(self.shape, parts, strict=False)]
+        lists = sum(isinstance(part, list | np.ndarray) for part in parts)
+        if len(parts) > self.ndim or lists > 1 or any(chosen.ndim > 1 for chosen in found):
+            raise IndexError(f"{self!r}: give a number or a slice for each axis, and a list for one; or see outer()")
+        forward = [isinstance(part, slice) and (part.step or 1) > 0 for part in parts]  # Zarr takes no others
+        return tuple(part if plain else chosen for part, chosen, plain in zip(parts, found, forward, strict=True))
 
     def outer(self, selection: tuple) -> np.ndarray:
         """Values at a selection along each axis for itself: slices, indices or arrays of them."""
@@ -222,13 +209,15 @@ class Subset:
         if name not in self._opened:
             layer, spec = self._layer_of(name)
             prefix = f"{layer.group}/{spec.stored_name}"
-            files = _array_files(self.release.records(layer.name), layer, spec, self.release.here(layer.name))
-            chunks = ZarrFiles(self.release.store, prefix, files)
-            place, cure = (
-                f"{self.release.place}/{prefix}",
-                self._without_images if layer.kind == "images" else self._not_here,
-            )
-            array = open_array(layer, spec, self.record.episodes, chunks)
+            here = self.release.here(layer.name)
+            files = {
+                layer.file_path(spec, number).removeprefix(f"{prefix}/"): record.files[name]
+                for number, record in self.release.records(layer.name).items()
+                if number in here and name in record.files
+            }
+            array = open_array(layer, spec, self.record.episodes, ZarrFiles(self.release.store, prefix, files))
+            cure = self._without_images if layer.kind == "images" else self._not_here
+            place = f"{self.release.place}/{prefix}"
             self._opened[name] = StoredArray(array, name, place, self.missing(layer), cure)
         return self._opened[name]
 
@@ -398,15 +387,3 @@ def _ranges(indices: np.ndarray) -> str:
     breaks = np.flatnonzero(np.diff(indices) != 1)
     starts, ends = np.r_[0, breaks + 1], np.r_[breaks, len(indices) - 1]
     return ", ".join(f"{indices[a]}..{indices[b]}" for a, b in zip(starts, ends, strict=True))
-
-
-def _array_files(
-    shards: Mapping[int, ShardRecord], layer: Layer, spec: ArraySpec, here: Collection[int]
-) -> dict[str, ShardFile]:
-    """Key below an array's folder ("c/3/0/0") -> its file, of the shards that are here."""
-    prefix = f"{layer.group}/{spec.stored_name}/"
-    found = {}
-    for number, record in shards.items():
-        if number in here and (file := record.files.get(spec.name)):
-            found[layer.file_path(spec, number).removeprefix(prefix)] = file
-    return found

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import datetime
 import secrets
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,15 @@ from dmcvb_gen.dataset.manifest import (
     MANIFEST_BYTES,
     MANIFESTS,
     MAX_SHARD_BYTES,
+    POLICIES,
     PROVENANCE,
     RECIPES,
+    VIDEOS,
     ZARR_JSON,
     Copy,
     FileRecord,
     Layer,
+    ListedLayer,
     Resolved,
     ShardFile,
     ShardRecord,
@@ -49,7 +52,7 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.schema import array_metadata, encode
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import parse_json, sha256_bytes
+from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.storage.store import NotThere, Store
 
 PROVENANCE_BYTES = 2**20
@@ -84,8 +87,6 @@ def put(store: Store, path: str, data: bytes | Path, *, first_wins: bool = False
 
 def file_facts(data: bytes | Path) -> ShardFile:
     """Size and SHA-256 of bytes or of a local file."""
-    from dmcvb_gen.files import sha256_file
-
     if isinstance(data, bytes):
         return ShardFile(bytes=len(data), sha256=sha256_bytes(data))
     return ShardFile(bytes=data.stat().st_size, sha256=sha256_file(data))
@@ -106,8 +107,11 @@ def begin(store: Store, recipe: Resolved, inputs: Mapping[str, Path | bytes]) ->
     there = read_recipes(store)
     if any(each.sha256 == recipe.sha256 for each in there):
         return
-    if not there and (strange := next(iter(sorted(store.list())), None)) and not _only_inputs(store):
-        raise StoreError(f"{store.place} holds no release but other files ({strange}); choose an empty place for --out")
+    strange = [] if there else [path for path in store.list() if not path.startswith((POLICIES, VIDEOS))]
+    if strange:
+        raise StoreError(
+            f"{store.place} holds no release but other files ({strange[0]}); choose an empty place for --out"
+        )
     if store.size(COPY) is not None and not _adds_images_alone(Release.open(store), recipe):
         raise StoreError(f"{store.place} is a copy of a release and does not grow; choose another --out")
     check_agree([*there, recipe])
@@ -123,14 +127,8 @@ def _adds_images_alone(release: Release, recipe: Resolved) -> bool:
     return not strange and known >= {subset.name for subset in recipe.subsets}
 
 
-def _only_inputs(store: Store) -> bool:
-    """Return True if a place has nothing but the inputs of a release whose begin was interrupted."""
-    return all(path.startswith(("policies/", "backgrounds/")) for path in store.list())
-
-
-def check_agree(recipes: Iterable[Resolved]) -> None:
+def check_agree(recipes: Sequence[Resolved]) -> None:
     """Raises StoreError if recipes describe a layer or a subset differently."""
-    recipes = list(recipes)
     merged_layers(recipes)
     merged_subsets(subset for recipe in recipes for subset in recipe.subsets)
 
@@ -332,50 +330,54 @@ def _group(attributes: dict[str, Any]) -> dict[str, Any]:
 # -- copies ---------------------------------------------------------------------------------------
 
 
-def finish_copy(store: Store, manifest_text: bytes, source: str, promised: Mapping[str, Collection[int]]) -> Release:
+def finish_copy(store: Store, manifest_text: bytes, source: str, shards: Iterable[Shard]) -> Release:
     """Make a folder with copied shards and lists a copy: copy.json, then the manifest, then zarr.json.
 
     Args:
       manifest_text: the manifest that was copied from, to the byte.
       source: where it was copied from, without passwords.
-      promised: layer -> shards that were to be copied; those promised before stay so.
+      shards: that were to be copied; those promised before stay so. If all are here, it is a copy no more.
     """
-    digest = sha256_bytes(manifest_text)
-    before: dict[str, Collection[int]] = {}
-    if store.size(COPY) is not None:
-        old = parse(Copy, store.read(COPY, MANIFEST_BYTES), f"{store.place}/{COPY}")
-        before = {name: old.shards(name) for name in old.promised}
-    names = sorted({*before, *promised})
-    runs = {name: _runs({*before.get(name, ()), *promised.get(name, ())}) for name in names}
-    store.replace(COPY, canonical_json(Copy(manifest=digest, source=source, promised=runs)))
+    old = Release.read_copy(store)
+    promised = {name: set(old.shards(name)) for name in old.promised} if old else {}
+    store.replace(COPY, canonical_json(_copy(sha256_bytes(manifest_text), source, _by_layer(shards, promised))))
     store.replace(MANIFEST, manifest_text)
     release = Release.open(store)
     write_plain_metadata(release)
+    listed = [layer for layer in release.manifest.layers if isinstance(layer, ListedLayer)]
+    if all(len(release.here(layer.name)) == layer.shards for layer in listed):
+        store.delete(COPY)
     return release
 
 
 def copy_of(release: Release, shards: Iterable[Shard]) -> Release:
     """The release as a copy that promises these shards alone; the release itself if they are all."""
-    promised: dict[str, set[int]] = {}
-    for shard in shards:
-        promised.setdefault(shard.layer.name, set()).add(shard.number)
+    promised = _by_layer(shards, {})
     if release.digest is None or all({*release.records(name)} <= promised.get(name, set()) for name in release.layers):
         return release
-    runs = {name: _runs(promised[name]) for name in sorted(promised)}
-    copy = Copy(manifest=release.digest, source=f"{release.manifest.name} {release.manifest.version}", promised=runs)
+    copy = _copy(release.digest, f"{release.manifest.name} {release.manifest.version}", promised)
     part = Release(release.store, release.manifest, release.digest, release.compared, copy)
     part._here |= {name: frozenset(promised.get(name, ())) for name in release.layers}
     return part
 
 
-def _runs(numbers: Collection[int]) -> tuple[tuple[int, int], ...]:
-    runs: list[list[int]] = []
-    for number in sorted(numbers):
-        if runs and runs[-1][1] == number:
-            runs[-1][1] += 1
-        else:
-            runs.append([number, number + 1])
-    return tuple((first, last) for first, last in runs)
+def _by_layer(shards: Iterable[Shard], numbers: dict[str, set[int]]) -> dict[str, set[int]]:
+    """Layer -> numbers of its shards, added to those that are known."""
+    for shard in shards:
+        numbers.setdefault(shard.layer.name, set()).add(shard.number)
+    return numbers
+
+
+def _copy(digest: str, source: str, promised: Mapping[str, Collection[int]]) -> Copy:
+    """What copy.json says, with runs (first, last + 1) of shards."""
+    runs: dict[str, list[list[int]]] = {name: [] for name in sorted(promised)}
+    for name, found in runs.items():
+        for number in sorted(promised[name]):
+            if found and found[-1][1] == number:
+                found[-1][1] += 1
+            else:
+                found.append([number, number + 1])
+    return Copy.model_validate({"manifest": digest, "source": source, "promised": runs})
 
 
 # -- provenance -----------------------------------------------------------------------------------

@@ -29,30 +29,17 @@ from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.options import Local, Location, checked
 from dmcvb_gen.policies.header import OWN_CODE, origin_of
-from dmcvb_gen.policies.paper import paper_returns
-from dmcvb_gen.release.croissant import (
-    HOME,
-    Publication,
-    croissant,
-    derived_from,
-    generator,
-    groups,
-    is_imported,
-    page_of,
-)
+from dmcvb_gen.release.croissant import HOME, Publication, croissant, derived_from, generator, groups, page_of
 from dmcvb_gen.release.episode_table import TABLE, header_facts, table_rows, write_table
-from dmcvb_gen.release.statistics import EPISODES as STATISTICS_EPISODES
-from dmcvb_gen.release.statistics import states_json
 from dmcvb_gen.release.templates import fill
-from dmcvb_gen.spec import ALL_PARTS, CUE, DISTRACTOR_KINDS, FIXED, DistractorSetting
+from dmcvb_gen.spec import ALL_PARTS, CUE, DISTRACTOR_KINDS, DistractorSetting
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.tasks import ACTION_REPEAT
 from dmcvb_gen.text import pluralize
 
 README, CROISSANT = "README.md", "croissant.json"
-PLOT, SHEET = f"{CARD_FOLDER}returns.png", f"{CARD_FOLDER}contact_sheet.png"
-STATES = f"{CARD_FOLDER}states.json"
+SHEET = f"{CARD_FOLDER}contact_sheet.png"
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Hugging Face's size categories, counted in steps."""
 CITATION = """@inproceedings{ortiz2024dmcvb,
@@ -113,9 +100,8 @@ def _write_files(
     texts = _texts(release, made / TABLE, published)
     for name, text in texts.items():
         (made / name).write_text(text)
-    plot_returns(release, made / PLOT)
     Image.fromarray(_sheet(release)).save(made / SHEET, "PNG")
-    return [*texts, PLOT, SHEET, TABLE]
+    return [*texts, SHEET, TABLE]
 
 
 def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = None) -> Publication:
@@ -171,7 +157,7 @@ def _texts(release: Release, table: Path, published: Publication) -> dict[str, s
     limits = _limits(release)
     metadata = croissant(release, facts, summary, CITATION, limits, table, published)
     text = card_text(release, facts, summary, limits, header_facts(table))
-    return {README: text, CROISSANT: metadata, STATES: states_json(release)}
+    return {README: text, CROISSANT: metadata}
 
 
 def _sheet(release: Release) -> np.ndarray:
@@ -187,7 +173,7 @@ def _summary(release: Release, facts: dict[str, Any]) -> str:
     manifest = release.manifest
     tasks = ", ".join(dict.fromkeys(record.task for record in manifest.subsets))
     held = "pixels and states"
-    if not is_imported(release):
+    if not release.manifest.imported:
         held = "pixels, states, full physics states and the labels of every visual distractor"
     if not any(subset["images"] for subset in facts["subsets"]):
         held = "states, full physics states and the labels of every visual distractor, from which `dmcvb-gen paint` "
@@ -226,7 +212,7 @@ def card_text(
         "card.md.jinja",
         manifest=manifest,
         digest=release.digest,
-        imported=is_imported(release),
+        imported=release.manifest.imported,
         facts=facts,
         summary=summary,
         limits=limits,
@@ -234,7 +220,6 @@ def card_text(
         arrays=_arrays(release),
         statistics=STATISTICS,
         successes={s.name: float(s.read("terminated").mean()) for s in release.subsets.values() if s.record.goal_mode},
-        state_episodes=STATISTICS_EPISODES,
         distractors=_distractors(manifest),
         has_mazes=any(record.goal_mode is not None for record in manifest.subsets),
         making=_making(release),
@@ -242,8 +227,6 @@ def card_text(
         first=next(iter(release.subsets)),
         group=groups(release)[0],
         sheet=SHEET,
-        plot=PLOT,
-        states=STATES,
         table=TABLE,
         citation=CITATION,
     )
@@ -292,7 +275,7 @@ def _varied(setting: DistractorSetting) -> str:
 
 def _making(release: Release) -> list[str]:
     records, made_by = release.manifest.subsets, generator(release)
-    if is_imported(release):
+    if release.manifest.imported:
         lines = [f"Imported by {made_by}; nothing was simulated or rendered."]
     else:
         seeds = sorted({str(layer.makes["seed"]) for layer in release.layers.values() if "seed" in layer.makes})
@@ -347,7 +330,7 @@ def _limits(release: Release) -> list[str]:
         limits.append(f"An action is held for {held} control steps, in DMC-VB for {ACTION_REPEAT}.")
     seconds = {record.seconds_per_step for record in manifest.subsets}
     limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
-    if is_imported(release):
+    if release.manifest.imported:
         limits.append("Imported data have no physics states and no labels, so nothing can be rendered from them.")
     else:
         limits.append("Another processor or library version may change bits; `regenerate --check` says how far.")
@@ -365,34 +348,3 @@ def _lacking_videos(release: Release) -> list[str]:
             if there < record.distractor.videos:
                 found[f"{record.distractor.videos} background videos are asked for, and {there} are there."] = None
     return list(found)
-
-
-# -- pictures -------------------------------------------------------------------------------------
-
-
-def plot_returns(release: Release, path: Path) -> None:
-    """Box plots of episode returns as a PNG, a row a task and level, the paper's five numbers beneath each."""
-    from matplotlib.figure import Figure
-
-    groups: dict[tuple[str, str, bool], list[np.ndarray]] = {}
-    for subset in release.subsets.values():
-        groups.setdefault((subset.task, subset.level, subset.setting == FIXED), []).append(subset.returns)
-    boxes: list[dict[str, Any]] = []
-    shades: list[str] = []
-    for (task, level, fixed), values in groups.items():
-        low, p25, median, p75, high = np.quantile(np.concatenate(values), (0, 0.25, 0.5, 0.75, 1))
-        label = f"{task} {level}" + (f" {FIXED}" if fixed else "")
-        boxes.append(dict(label=label, whislo=low, q1=p25, med=median, q3=p75, whishi=high, fliers=[]))
-        shades.append("tab:blue")
-        if paper := None if fixed else paper_returns(task, level):  # fixed goals are others than the paper's
-            keys = dict(whislo="min", q1="p25", med="median", q3="p75", whishi="max")
-            boxes.append({name: paper[key] for name, key in keys.items()} | {"fliers": [], "label": "DMC-VB paper"})
-            shades.append("lightgray")
-    figure = Figure(figsize=(8, 0.6 + 0.3 * len(boxes)), layout="constrained")
-    axes = figure.subplots()
-    places = np.arange(len(boxes))[::-1]
-    drawn = axes.bxp(boxes, positions=places, orientation="horizontal", patch_artist=True, widths=0.6)
-    for patch, shade in zip(drawn["boxes"], shades, strict=True):
-        patch.set_facecolor(shade)
-    axes.set_xlabel("episode return (minimum, quartiles, maximum)")
-    figure.savefig(path, format="png", dpi=100, metadata={"Software": None})

@@ -70,11 +70,6 @@ def generator(release: Release) -> str:
     return " and ".join(dict.fromkeys(f"dmcvb-gen {n['environment'].get('dmcvb-gen', '?')}" for n in notes)) or PROGRAM
 
 
-def is_imported(release: Release) -> bool:
-    """Return True if a subset was imported."""
-    return any(record.imported for record in release.manifest.subsets)
-
-
 def derived_from(release: Release) -> list[str]:
     """What a release was made from, in words."""
     found = [recipe.derived for recipe in release.recipes if recipe.derived]
@@ -105,7 +100,7 @@ def croissant(
         "croissant.json.jinja",
         manifest=manifest,
         generator=generator(release),
-        imported=is_imported(release),
+        imported=manifest.imported,
         derived=derived_from(release),
         summary=summary,
         citation=citation,
@@ -133,22 +128,15 @@ def _inputs(release: Release) -> list[str]:
 
 def _files(release: Release, table: Path) -> Iterator[dict[str, Any]]:
     """Manifest, Zarr groups and the table of episodes."""
-    root = release.path
-    yield _file(
-        root / MANIFEST,
-        MANIFEST,
-        "application/json",
-        "Subsets and layers, with the SHA-256 of each layer's list.",
-    )
-    for group in groups(release):
-        path = f"{group}/{ZARR_JSON}"
-        text = f"Zarr group {group}: arrays, dimensions, state fields."
-        yield _file(root / path, path, "application/json", text)
-    yield _file(table, TABLE, "application/x-parquet", "A row an episode, with its first frame.")
-
-
-def _file(file: Path, path: str, kind: str, text: str) -> dict[str, Any]:
-    return dict(path=path, kind=kind, text=text, bytes=file.stat().st_size, sha256=sha256_file(file))
+    texts = {MANIFEST: "Subsets and layers, with the SHA-256 of each layer's list."}
+    texts |= {
+        f"{group}/{ZARR_JSON}": f"Zarr group {group}: arrays, dimensions, state fields." for group in groups(release)
+    }
+    texts |= {TABLE: "A row an episode, with its first frame."}
+    for path, text in texts.items():
+        file = table if path == TABLE else release.path / path
+        kind = "application/x-parquet" if path == TABLE else "application/json"
+        yield dict(path=path, kind=kind, text=text, bytes=file.stat().st_size, sha256=sha256_file(file))
 
 
 def _rows(release: Release, facts: dict[str, Any]) -> list[dict[str, Any]]:

@@ -8,15 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.dataset.gate import Release, Shard
-from dmcvb_gen.dataset.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json, is_attachment
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json
 from dmcvb_gen.dataset.writer import copy_of, plain_metadata, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.options import Count, Location, checked, progress_bar, refuse
 from dmcvb_gen.parallel import ProgressCallback, expect
 from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
-from dmcvb_gen.release.tree import attachments, described_files, grows_from, list_files, manifest_text, shard_files
+from dmcvb_gen.release.tree import attachments, described_files, list_files, manifest_text, release_at
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import quoted
 
@@ -61,20 +61,16 @@ def _publish_release(
     shards = list(release.shards(images=pixels))
     light = copy_of(release, shards)
     texts = attachments(release.store)
-    if light.copy:
-        texts[COPY] = canonical_json(light.copy)
     store.begin()
     tag = store.version(MANIFEST)
-    there = None if tag is None else _published(store, release)
+    there = release_at(store, release)
     same = there is not None and there.digest == release.digest
-    if there is None:
-        _refuse_others(store, release, shards)
-    elif not same:
+    if there is not None and not same:
         texts[f"{MANIFESTS}{there.digest}.json"] = manifest_text(there)  # what it replaces can still be cited
     names = [record.name for record in release.manifest.subsets]
     parts: list[Sequence[FileRecord]] = [
         [*described_files(release, names), *(file for shard in shards for file in shard.files)],
-        [shard_files(shard)[-1] for shard in shards],
+        [shard.record_file for shard in shards],
         list_files(release, release.layers),
     ]
     files = [file for part in parts for file in part]
@@ -82,6 +78,10 @@ def _publish_release(
     upload = _Upload(release, store, repair, workers, tick)
     for part in parts:
         upload.put(part)
+    if light.copy:
+        texts[COPY] = canonical_json(light.copy)
+    elif store.size(COPY) is not None:
+        store.delete(COPY)  # of images that were left out before
     plain = plain_metadata(light)
     if not same or upload.moved or _differ(store, texts):
         if not store.writable:  # one commit
@@ -101,40 +101,10 @@ def _check_complete(release: Release, root: str | Path, pixels: bool) -> None:
         raise StoreError(
             f"{root} is not complete; fetch or render the rest, or finish it with the same rollout, without --only"
         )
-    if not pixels and any(record.imported for record in release.manifest.subsets):
+    if not pixels and release.manifest.imported:
         raise StoreError(
             f"{root} was imported, and its images cannot be rendered; publish it with them, without --no-pixels"
         )
-
-
-def _published(store: Store, release: Release) -> Release:
-    """The release at a place: this one, or one that it has grown from.
-
-    Raises:
-      StoreError: another release is there.
-    """
-    there = Release.open(store)
-    if there.digest == release.digest or grows_from(release, there):
-        return there
-    mine, other = release.manifest, there.manifest
-    raise StoreError(
-        f"{store.place} already holds {other.name} {other.version} ({str(there.digest)[:12]}), and a published version "
-        f"never changes; publish {mine.name} {mine.version} to another URL (a changed byte is a new version)"
-    )
-
-
-def _refuse_others(store: Store, release: Release, shards: Sequence[Shard]) -> None:
-    """Refuse a place without a release that has files of something else, which ours would lie among.
-
-    Files of ours may be there, of an interrupted try.
-    """
-    names = [record.name for record in release.manifest.subsets]
-    ours = {file.path for file in (*described_files(release, names), *(f for s in shards for f in shard_files(s)))}
-    ours |= {file.path for file in list_files(release, release.layers)} | {*plain_metadata(release)} | {COPY}
-    others = sorted(path for path in store.list() if path not in ours and not is_attachment(path))
-    if others:
-        more = f" and {len(others) - 1} more" if others[1:] else ""
-        raise StoreError(f"{store.place} holds {others[0]}{more}, and no release; choose an empty destination")
 
 
 def _differ(store: Store, texts: Mapping[str, bytes]) -> bool:
@@ -160,9 +130,8 @@ class _Upload:
         Raises:
           StoreError: a file here is damaged, or one there has other bytes.
         """
-        todo = [file for file in files if self._sizes.get(file.path) != file.bytes]
-        if self._repair:
-            todo = [file for file in files if self._each(self._store, files)[file.path]]
+        known = self._each(self._store, files) if self._repair else {}
+        todo = [file for file in files if known.get(file.path) or self._sizes.get(file.path) != file.bytes]
         self._tick(len(files) - len(todo))
         for path, wrong in self._each(self._release.store, todo).items():
             if wrong:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection
 
-from dmcvb_gen.dataset.gate import Release, Shard
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import (
     ATTACHMENT_FILES,
     CARD_FOLDER,
+    COPY,
+    LAYERS,
     MANIFEST,
     MANIFEST_BYTES,
+    MANIFESTS,
     PROVENANCE,
     RECIPES,
+    RECORDS,
     FileRecord,
     LayerList,
     ListedLayer,
     Manifest,
     canonical_json,
+    is_attachment,
     list_path,
 )
 from dmcvb_gen.dataset.writer import PROVENANCE_BYTES
@@ -25,42 +29,11 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import NotThere, Store
 
-CARD = tuple(f"{CARD_FOLDER}{name}" for name in ("returns.png", "contact_sheet.png", "states.json", "episodes.parquet"))
+CARD = tuple(f"{CARD_FOLDER}{name}" for name in ("contact_sheet.png", "episodes.parquet"))
 ATTACHMENTS = (*ATTACHMENT_FILES, *CARD)
 """Files that are copied with a release as they are; no digest covers them."""
 ATTACHMENT_BYTES, NOTES = 2**30, 100
 """The largest of them, and the number of notes of provenance that go with a release."""
-
-
-@dataclass(frozen=True)
-class Listed:
-    """A file that a release names.
-
-    Attributes:
-      place: the layer that it belongs to, or its own path.
-    """
-
-    place: str
-    file: FileRecord
-
-
-def shard_files(shard: Shard) -> tuple[FileRecord, ...]:
-    """Files of a shard, its record last."""
-    return (*shard.files, _record_of(shard.record_path, canonical_json(shard.record)))
-
-
-def layer_files(release: Release, name: str) -> Iterator[Listed]:
-    """Files of the shards of a layer that are to be here.
-
-    Raises:
-      StoreError: the layer's list is missing or was altered.
-    """
-    layer, here = release.layers[name], release.here(name)
-    if here:
-        for number, record in sorted(release.records(name).items()):
-            if number in here:
-                shard = Shard(layer, number, record, True)
-                yield from (Listed(name, file) for file in shard_files(shard))
 
 
 def described_files(release: Release, names: Collection[str]) -> tuple[FileRecord, ...]:
@@ -69,7 +42,7 @@ def described_files(release: Release, names: Collection[str]) -> tuple[FileRecor
     Raises:
       StoreError: a recipe is missing or was altered.
     """
-    recipes = [_record_of(f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe)) for recipe in release.recipes]
+    recipes = [FileRecord.of(f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe)) for recipe in release.recipes]
     return (*release.inputs_of(names), *recipes)
 
 
@@ -77,16 +50,11 @@ def list_files(release: Release, layers: Collection[str]) -> tuple[FileRecord, .
     """The lists of layers, of a finished release; images that only this copy has are in no list yet."""
     found = {}
     for name in layers:
-        if not isinstance(release.layers[name], ListedLayer):
-            continue
-        records = release.records(name)
-        text = canonical_json(LayerList(shards=tuple(records[number] for number in sorted(records))))
-        found[list_path(sha256_bytes(text))] = text
-    return tuple(_record_of(path, text) for path, text in found.items())
-
-
-def _record_of(path: str, text: bytes) -> FileRecord:
-    return FileRecord(path=path, bytes=len(text), sha256=sha256_bytes(text))
+        if isinstance(layer := release.layers[name], ListedLayer):
+            records = release.records(name)
+            text = canonical_json(LayerList(shards=tuple(records[number] for number in sorted(records))))
+            found[layer.list] = FileRecord.of(list_path(layer.list), text)
+    return tuple(found.values())
 
 
 def manifest_text(release: Release) -> bytes:
@@ -123,10 +91,49 @@ def grows_from(new: Release, old: Release) -> bool:
     for name, layer in old.layers.items():
         if name not in new.layers or new.layers[name].key != layer.key:
             return False
-        records: Mapping = new.records(name)
+        records = new.records(name)
         if any(records.get(number) != record for number, record in old.records(name).items()):
             return False
     episodes = {record.name: record.episodes for record in new.manifest.subsets}
     return isinstance(old.manifest, Manifest) and all(
         record.episodes <= episodes.get(record.name, 0) for record in old.manifest.subsets
     )
+
+
+def folders_of(release: Release) -> tuple[str, ...]:
+    """Folders that nothing but a release's shards, their lists and their history lies in."""
+    return (RECORDS, LAYERS, MANIFESTS, PROVENANCE, *(f"{layer.group}/" for layer in release.layers.values()))
+
+
+def release_at(store: Store, release: Release) -> Release | None:
+    """What is at the place that a release goes to: itself, or one that it has grown from.
+
+    Returns:
+      None if nothing is there, or what an interrupted try has left.
+
+    Raises:
+      StoreError: something else is there.
+    """
+    copy = Release.read_copy(store)
+    if copy is not None and copy.manifest == release.digest:
+        return release
+    if store.size(MANIFEST) is not None:
+        there = Release.open(store)
+        if there.digest == release.digest or grows_from(release, there):
+            return there
+        raise StoreError(
+            f"{store.place} already holds {_named(there)} and not {_named(release)}, and a release never changes; "
+            "choose another place (a changed byte is a new version)"
+        )
+    ours = {COPY, *(f"{RECIPES}{recipe.sha256}.json" for recipe in release.recipes)}
+    ours |= {file.path for file in release.manifest.inputs}
+    folders = folders_of(release)
+    others = [path for path in store.list() if path not in ours and not path.startswith(folders)]
+    if others := [path for path in others if not is_attachment(path)]:
+        more = f" and {len(others) - 1} more" if others[1:] else ""
+        raise StoreError(f"{store.place} holds {others[0]}{more}, and not this release; choose an empty destination")
+    return None
+
+
+def _named(release: Release) -> str:
+    return f"{release.manifest.name} {release.manifest.version} ({str(release.digest)[:12]})"

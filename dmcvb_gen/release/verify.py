@@ -14,25 +14,14 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import (
-    COPY,
-    LAYERS,
-    MANIFEST,
-    MANIFESTS,
-    PROVENANCE,
-    RECIPES,
-    RECORDS,
-    FileRecord,
-    is_attachment,
-)
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, FileRecord, is_attachment
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.writer import plain_metadata, wrong_bytes
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
-from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.options import Location, checked, progress_bar, refuse
-from dmcvb_gen.parallel import Pool, ProgressCallback, Ray, Workers, expect, ignore, in_order, open_pool
+from dmcvb_gen.parallel import Pool, ProgressCallback, Ray, Workers, expect, ignore, in_order
 from dmcvb_gen.release.issue import NOT_PART, UNCHECKED, Issue
-from dmcvb_gen.release.tree import Listed, described_files, layer_files, list_files
+from dmcvb_gen.release.tree import described_files, folders_of, list_files
 from dmcvb_gen.storage.places import is_url
 
 SAMPLE_FILES = 40
@@ -41,7 +30,8 @@ THREADS = 8
 """Files whose bytes are read at a time."""
 PREVIEWS = "preview/"
 """Folder that `preview` and `view` write to; no part of a release."""
-KNOWN = (RECIPES, RECORDS, LAYERS, MANIFESTS, PROVENANCE, PREVIEWS)
+Listed = tuple[str, FileRecord]
+"""A file that a release names, after the layer that it belongs to, or its own path."""
 
 log = logging.getLogger(__name__)
 
@@ -107,8 +97,9 @@ def verify(
     if is_url(str(release)):
         threads = THREADS if workers is None else workers
         refuse("at a URL nothing is rendered or simulated", backgrounds=backgrounds, workers=isinstance(threads, Ray))
+        opened = Release.open(str(release), storage_options)
         with progress_bar(progress, " files", scaled=False) as bar:
-            return verify_url(str(release), storage_options, everything, bar, threads)  # type: ignore[arg-type]
+            return _verify_bytes(opened, everything, bar, threads)  # type: ignore[arg-type]
     refuse(f"{release} is a folder, which is always read whole", all=everything, option=storage_options)
     with progress_bar(progress, " checks", scaled=False) as bar:
         return verify_folder(release, None if backgrounds is None else str(backgrounds), bar, workers or 1)
@@ -132,42 +123,25 @@ def verify_folder(
     Raises:
       DmcvbError: there is no release, or it has no shards yet.
     """
-    if not isinstance(workers, Pool):
-        with open_pool(workers, tick=tick) as pool:
-            return verify_folder(place, backgrounds, tick, pool, names)
     release = Release.open(place)
     files, findings = _expected(release)
     expect(tick, len(files) + len(release.manifest.subsets))
-    findings += [*_wrong(release, files, tick), *_strange(release, files)]
+    findings += [*_wrong(release, files, tick, THREADS), *_strange(release, files)]
     sound = _sound(release, findings)
     chosen = [subset for subset in sound if len(subset) and (names is None or subset.name in names)]
-    if not chosen and not findings:
+    if not findings and not any(map(len, sound)):
         raise DmcvbError(f"{place} has no episodes yet; run the rollout first")
     for found in in_order(_check_subset, [(subset, backgrounds) for subset in chosen], workers, tick):
         findings += found
     return _verification(release, chosen, findings, len(files), sound)
 
 
-def verify_url(
-    url: str,
-    options: dict[str, Any] | None = None,
-    everything: bool = False,
-    tick: ProgressCallback = ignore,
-    workers: int = THREADS,
-) -> Verification:
+def _verify_bytes(release: Release, everything: bool, tick: ProgressCallback, workers: int) -> Verification:
     """Check the bytes of a release at a URL; nothing is stored on this machine.
 
     Args:
-      url: its URL, or "<URL>@sha256:<digest>".
-      options: options of the storage client.
       everything: read all files. A sample is read otherwise, and of the other files the size is compared.
-      tick: told the place of each file.
-      workers: files at a time.
-
-    Raises:
-      StoreError: no release is there, or it cannot be read.
     """
-    release = Release.open(url, options)
     files, findings = _expected(release)
     sample = files
     if not everything:
@@ -204,13 +178,6 @@ def _verification(
 # -- bytes ----------------------------------------------------------------------------------------
 
 
-def check_files(place: str | Path) -> list[Issue]:
-    """What is wrong with the bytes of a release's files, and files that belong to no release."""
-    release = Release.open(place)
-    files, findings = _expected(release)
-    return [*findings, *_wrong(release, files), *_strange(release, files)]
-
-
 def _expected(release: Release) -> tuple[list[Listed], list[Issue]]:
     """All files that must be here, and issues of what should name them."""
     files: list[Listed] = []
@@ -218,39 +185,37 @@ def _expected(release: Release) -> tuple[list[Listed], list[Issue]]:
     used: set[str] = set()  # layers of which shards are here
     for name in release.layers:
         try:
-            files += layer_files(release, name)
-            used |= {name} if release.here(name) else set()
+            here = [shard for shard in release.layer_shards(name) if shard.here]
+            files += [(name, file) for shard in here for file in (*shard.files, shard.record_file)]
+            used |= {name} if here else set()
         except StoreError as error:
             findings.append(Issue("files", name, str(error)))
-    here = {name for name, layer in release.layers.items() if name in used or layer.kind == "images"}
-    names = [record.name for record in release.manifest.subsets if {*record.layers} <= here]
+    usable = {name for name, layer in release.layers.items() if name in used or layer.kind == "images"}
+    names = [record.name for record in release.manifest.subsets if {*record.layers} <= usable]
     try:
-        files += [Listed(file.path, file) for file in described_files(release, names)]
+        files += [(file.path, file) for file in described_files(release, names)]
     except StoreError as error:
         findings.append(Issue("files", RECIPES, str(error)))
     if not release.in_the_making and not findings:
-        files += [Listed(file.path, file) for file in list_files(release, used)]
-        for path, text in plain_metadata(release).items():
-            files.append(Listed(path, FileRecord(path=path, bytes=len(text), sha256=sha256_bytes(text))))
+        plain = (FileRecord.of(path, text) for path, text in plain_metadata(release).items())
+        files += [(file.path, file) for file in (*list_files(release, used), *plain)]
     return files, findings
 
 
-def _wrong(
-    release: Release, files: Sequence[Listed], tick: ProgressCallback = ignore, workers: int = THREADS
-) -> list[Issue]:
+def _wrong(release: Release, files: Sequence[Listed], tick: ProgressCallback, workers: int) -> list[Issue]:
     """Issues of files that are not as recorded, in their order."""
 
     def look(listed: Listed) -> str | None:
-        tick(listed.place)
-        return wrong_bytes(release.store, listed.file)
+        tick(listed[0])
+        return wrong_bytes(release.store, listed[1])
 
     with ThreadPoolExecutor(max(1, workers)) as pool:
-        looked = zip(files, pool.map(look, files), strict=True)
-        return [Issue("files", one.place, _told(one, wrong)) for one, wrong in looked if wrong]
+        return [_issue(one, wrong) for one, wrong in zip(files, pool.map(look, files), strict=True) if wrong]
 
 
-def _told(listed: Listed, wrong: str) -> str:
-    return wrong if listed.place == listed.file.path else f"{listed.file.path} {wrong}"
+def _issue(listed: Listed, wrong: str) -> Issue:
+    place, file = listed
+    return Issue("files", place, wrong if place == file.path else f"{file.path} {wrong}")
 
 
 def _wrong_sizes(release: Release, files: Sequence[Listed]) -> list[Issue]:
@@ -260,13 +225,13 @@ def _wrong_sizes(release: Release, files: Sequence[Listed]) -> list[Issue]:
     except StoreError:
         return []  # a sample was read
     text = "is missing or has another size"
-    return [Issue("files", one.place, _told(one, text)) for one in files if sizes.get(one.file.path) != one.file.bytes]
+    return [_issue(one, text) for one in files if sizes.get(one[1].path) != one[1].bytes]
 
 
 def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
     """Files that belong to no release."""
-    known = {listed.file.path for listed in files} | {MANIFEST, COPY}
-    folders = (*KNOWN, *(f"{layer.group}/" for layer in release.layers.values()))
+    known = {file.path for _, file in files} | {MANIFEST, COPY}
+    folders = (RECIPES, PREVIEWS, *folders_of(release))
     for path in release.store.list():
         if path not in known and not path.startswith(folders) and not is_attachment(path):
             yield Issue("files", path, f"{NOT_PART}; move it elsewhere")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,6 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.interface import ANY, Store
 from dmcvb_gen.storage.places import BUCKETS
 
-PROBED = 2**20
-"""Bytes of the largest file that is sent twice to see whether the store heeds conditions."""
 PLAIN_OPTIONS = ("endpoint_url", "region_name", "anon", "project", "account_name", "account_host")
 """Options that messages may show."""
 
@@ -42,13 +40,9 @@ class ObjectStore(Store):
     @property
     def _system(self) -> fsspec.AbstractFileSystem:
         """The file system; fsspec keeps it for this process alone, so that a fork gets its own."""
+        importlib.import_module(BUCKETS[self.protocol])  # fsspec's own error does not name the package
         try:
             return fsspec.filesystem(self.protocol, use_listings_cache=False, **self.options)
-        except ImportError:
-            package = BUCKETS[self.protocol]
-            raise StoreError(
-                f"{self.protocol}:// needs a package that is not installed: pip install {package}"
-            ) from None
         except TypeError as error:
             raise StoreError(f"{self.place} takes no such options ({error}); see the file system's own") from None
 
@@ -91,17 +85,17 @@ class ObjectStore(Store):
         start = len(self.base.lstrip("/")) + 1
         return {path.lstrip("/")[start:]: facts["size"] for path, facts in found.items()}
 
-    def _folders(self) -> Iterable[str]:
-        found = self._system.ls(self.base, detail=True)
-        return [facts["name"].rstrip("/").rpartition("/")[2] for facts in found if facts["type"] == "directory"]
-
     # -- writing ----------------------------------------------------------------------------------
 
     def _create(self, path: str, data: bytes | Path, move: bool) -> None:
         self._put_new(path, data)
-        size = data.stat().st_size if isinstance(data, Path) else len(data)
-        if size <= PROBED:
-            self._probe(path, data)
+        if self.place not in _heeding:
+            try:  # once more: a store that heeds If-None-Match refuses it
+                self._put_new(path, data)
+            except FileExistsError:
+                _heeding.add(self.place)
+            else:
+                raise self._unsafe()
 
     def _put_new(self, path: str, data: bytes | Path) -> None:
         with self._conditions(path):
@@ -109,17 +103,6 @@ class ObjectStore(Store):
                 self._system.put_file(str(data), self._full(path), mode="create")
             else:
                 self._system.pipe_file(self._full(path), data, mode="create")
-
-    def _probe(self, path: str, data: bytes | Path) -> None:
-        """Send the first object a second time, which a store that heeds If-None-Match refuses."""
-        if _heeds_conditions.get(self.place):
-            return
-        try:
-            self._put_new(path, data)
-        except FileExistsError:
-            _heeds_conditions[self.place] = True
-            return
-        raise self._unsafe()
 
     def _unsafe(self) -> StoreError:
         return StoreError(
@@ -177,7 +160,7 @@ class ObjectStore(Store):
         self._system.rm_file(self._full(path))
 
 
-_heeds_conditions: dict[str, bool] = {}
+_heeding: set[str] = set()
 """Places that have refused to overwrite an object that was put with If-None-Match."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -75,10 +75,6 @@ class LocalStore(Store):
                 if stat.S_ISREG(status.st_mode):
                     found[path.relative_to(self.folder).as_posix()] = status.st_size
         return found
-
-    def _folders(self) -> Iterable[str]:
-        with os.scandir(self.folder) as entries:
-            return [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
 
     def _create(self, path: str, data: bytes | Path, move: bool) -> None:
         full = self._at(path)

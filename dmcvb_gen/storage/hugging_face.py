@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -115,11 +115,6 @@ class HubStore(Store):
         entries = self._api.list_repo_tree(**self._where, **given)
         return {entry.path.removeprefix(self.folder_there): entry.size for entry in entries if hasattr(entry, "size")}
 
-    def _folders(self) -> Iterable[str]:
-        given = {"path_in_repo": self.folder_there.strip("/") or None, "revision": self._commit_read()}
-        entries = self._api.list_repo_tree(**self._where, **given)
-        return [entry.path.rpartition("/")[2] for entry in entries if not hasattr(entry, "size")]
-
     # -- writing ----------------------------------------------------------------------------------
 
     def _read_only(self) -> StoreError:
@@ -181,8 +176,8 @@ class HubStore(Store):
     def tag(self, name: str, message: str) -> None:
         """`name`, after the release's folder if it has one in the repository."""
         name = "-".join([*self.folder_there.split("/")[:-1], name])
-        given = {"tag": name, "tag_message": message, "revision": self._commit_read(), "exist_ok": True}
         with self._errors(None, "write to"):
+            given = {"tag": name, "tag_message": message, "revision": self._commit_read(), "exist_ok": True}
             self._api.create_tag(**self._where, **given)
 
 
@@ -198,13 +193,7 @@ def _blob(data: bytes) -> str:
 
 
 def new_api(endpoint: str | None = None, token: str | None = None) -> Any:
-    """A `huggingface_hub.HfApi`; with the environment's endpoint and token by default.
+    """A `huggingface_hub.HfApi`; with the environment's endpoint and token by default."""
+    from huggingface_hub import HfApi
 
-    Raises:
-      StoreError: the package is missing.
-    """
-    try:
-        from huggingface_hub import HfApi
-    except ImportError:
-        raise StoreError("hf:// needs a package that is not installed: pip install huggingface_hub") from None
     return HfApi(endpoint=endpoint, token=token)

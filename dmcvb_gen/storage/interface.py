@@ -10,7 +10,7 @@ import abc
 import contextlib
 import errno
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -87,10 +87,6 @@ class Store(abc.ABC):
         """Every file below a folder ("" for all): path -> bytes. Raises FileNotFoundError."""
         raise StoreError(f"{self.place} gives no list of its files; fetch the release first")
 
-    def _folders(self) -> Iterable[str]:
-        """Names of the folders right below. Raises FileNotFoundError."""
-        raise StoreError(f"{self.place} gives no list of its folders; give the URL of one release")
-
     def _create(self, path: str, data: bytes | Path, move: bool) -> None:
         """Write a file as one atomic operation. Raises FileExistsError."""
         raise self._read_only()
@@ -125,10 +121,7 @@ class Store(abc.ABC):
         Raises:
           NotThere: there is no such file. StoreError: it is larger, it is no regular file, or see the class.
         """
-        with self._errors(path, "read"):
-            data = b"".join(self._pieces(path, limit + 1))
-        self._check_limit(path, len(data), limit)
-        return data
+        return b"".join(self._bounded(path, limit))
 
     def read_range(self, path: str, start: int, length: int) -> bytes:
         """Exactly `length` bytes of a file, from byte `start` on.
@@ -155,13 +148,20 @@ class Store(abc.ABC):
         Raises:
           NotThere: there is no such file. StoreError: it has more than `limit` bytes, or see the class.
         """
-        digest, size = hashlib.sha256(), 0
+        digest = hashlib.sha256()
+        for piece in self._bounded(path, limit):
+            digest.update(piece)
+        return digest.hexdigest()
+
+    def _bounded(self, path: str, limit: int) -> Iterator[bytes]:
+        """A file's bytes piece by piece. Raises StoreError, also if there are more than `limit`."""
+        size = 0
         with self._errors(path, "read"):
             for piece in self._pieces(path, limit + 1):
-                digest.update(piece)
                 size += len(piece)
-        self._check_limit(path, size, limit)
-        return digest.hexdigest()
+                if size > limit:
+                    raise StoreError(f"{self.place}/{path} is larger than the {limit:,} bytes that it may have")
+                yield piece
 
     def version(self, path: str) -> str | None:
         """An opaque name of a file's present content, for `replace`; None if it is not there. Ask before you read."""
@@ -172,10 +172,6 @@ class Store(abc.ABC):
         prefix = prefix.strip("/")
         found = self._found(prefix or None, lambda: self._list(prefix), {})
         return {path: size for path, size in sorted(found.items()) if "/." not in f"/{path}"}
-
-    def folders(self) -> Sequence[str]:
-        """Names of the folders right below, hidden ones apart; maybe none."""
-        return self._found(None, lambda: sorted(name for name in self._folders() if not name.startswith(".")), [])
 
     def download(self, path: str, target: str | Path, size: int, sha256: str) -> None:
         """Copy a file to `target` on this machine, whole or not at all; what is there already stays.
@@ -201,12 +197,8 @@ class Store(abc.ABC):
                     self._bring(path, out, size, sha256)
 
     def _bring(self, path: str, out: BinaryIO, size: int, sha256: str) -> None:
-        digest, pieces = hashlib.sha256(), self._pieces(path, size + 1)
-        while True:
-            with self._errors(path, "read"):
-                piece = next(pieces, None)
-            if piece is None:
-                break
+        digest = hashlib.sha256()
+        for piece in self._bounded(path, size):
             digest.update(piece)
             out.write(piece)
         if out.tell() != size or digest.hexdigest() != sha256:
@@ -279,12 +271,7 @@ class Store(abc.ABC):
             return None if made else path
 
         with ThreadPoolExecutor(max(1, workers)) as pool:
-            waiting = [pool.submit(put, path) for path in paths]
-            try:
-                return [there for there in (future.result() for future in waiting) if there]
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+            return [there for there in pool.map(put, paths) if there]
 
     def finish(self, contents: Mapping[str, bytes], expected: str | None = ANY) -> bool:
         """Put small files in order; the last one, the manifest, in place of version `expected` (see `replace`)."""
@@ -297,10 +284,6 @@ class Store(abc.ABC):
         """Give what was published a name, if the place has versions."""
 
     # -- errors -----------------------------------------------------------------------------------
-
-    def _check_limit(self, path: str, size: int, limit: int) -> None:
-        if size > limit:
-            raise StoreError(f"{self.place}/{path} is larger than the {limit:,} bytes that it may have")
 
     @contextlib.contextmanager
     def _errors(self, path: str | None, doing: str) -> Iterator[None]:

@@ -41,8 +41,7 @@ class Place:
         text = str(place)
         if not text or not text.isprintable():
             raise StoreError(f"{text[:80]!r} is no place; give {KNOWN}")
-        found = None if isinstance(place, Path) and not _SCHEME.match(text) else _SCHEME.match(text)
-        if found is None:
+        if (found := _SCHEME.match(text)) is None:
             return cls("file", _folder(text))
         protocol, rest = found[1].lower(), text[found.end() :]
         if protocol in ("file", "local"):
@@ -77,8 +76,6 @@ class Place:
             )
         if not bucket:
             raise StoreError(f"{protocol}:// names no bucket; give {protocol}://BUCKET/NAME")
-        if "?versionId=" in rest:
-            raise StoreError(f"{protocol}://{rest.partition('?')[0]} names a version of an object; remove ?versionId")
         return cls(protocol, rest.rstrip("/"))
 
     def __str__(self) -> str:

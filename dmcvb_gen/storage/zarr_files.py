@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import logging
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
@@ -15,35 +15,23 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.interface import Store as Files
 
 
-class Recorded(Protocol):
-    """Size and SHA-256 (hex) of a file, as a record has them."""
-
-    @property
-    def bytes(self) -> int: ...
-    @property
-    def sha256(self) -> str: ...
-
-
 class ZarrFiles(Store):
     """The files below a folder of a store for Zarr, to read.
 
     Args:
-      files: key below `prefix` -> its record. Other keys are absent without a request; one of these that is not there,
-        or has other bytes, is an error, never zeros.
+      files: key below `prefix` -> its record (`bytes`, `sha256`). Other keys are absent without a request; one of these
+        that is not there, or has other bytes, is an error, never zeros.
     """
 
     supports_writes = supports_deletes = supports_listing = False
 
-    def __init__(self, store: Files, prefix: str, files: Mapping[str, Recorded]):
+    def __init__(self, store: Files, prefix: str, files: Mapping[str, Any]):
         super().__init__(read_only=True)
         self.store, self.prefix, self.files = store, prefix.strip("/"), files
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, ZarrFiles)
-            and (self.store, self.prefix) == (other.store, other.prefix)
-            and self.files == other.files
-        )
+        mine = (self.store, self.prefix, self.files)
+        return isinstance(other, ZarrFiles) and mine == (other.store, other.prefix, other.files)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         file = self.files.get(key)

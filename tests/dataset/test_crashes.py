@@ -8,40 +8,37 @@ from pathlib import Path
 
 import pytest
 
-from dmcvb_gen.dataset import gate, writer
+from dmcvb_gen.dataset import writer
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.release.fetch import _Download, fetch
+from dmcvb_gen.release.publish import publish
 from dmcvb_gen.storage.store import Store, open_store
+from tests.conftest import wrong_files
 from tests.dataset import made_up, oracle
-from tests.dataset.killing import Killed, KillingStore
+from tests.dataset.killing import Killed, die
 
 SOURCE = "source"
 
 
-def _rollout(store: Store, root: Path) -> None:
-    made_up.make(store, made_up.recipe(3))
+def _rollout(root: Path) -> None:
+    made_up.make(open_store(root), made_up.recipe(3))
 
 
-def _light(store: Store, root: Path) -> None:
-    made_up.make(store, made_up.recipe(3, images=False))
+def _light(root: Path) -> None:
+    made_up.make(open_store(root), made_up.recipe(3, images=False))
 
 
-def _growth(store: Store, root: Path) -> None:
-    made_up.make(store, made_up.recipe(5))
+def _growth(root: Path) -> None:
+    made_up.make(open_store(root), made_up.recipe(5))
 
 
-def _fetch(store: Store, root: Path) -> None:
-    """Copy the second shard of one setting, as `fetch` does."""
-    source = open_store(root / SOURCE)
-    release = Release.open(source)
-    copy = [f"recipes/{digest}.json" for digest in release.manifest.recipes]
-    promised: dict[str, set[int]] = {}
-    for shard in release.shards(["hop/random/none"], (2, 3)):
-        copy += [*[file.path for file in shard.files], shard.record_path]
-        promised.setdefault(shard.layer.name, set()).add(shard.number)
-    for path in [*copy, *release.lists()]:
-        store.create(path, source.folder / path)
-    writer.finish_copy(store, source.read("manifest.json", 10**6), source.place, promised)
+def _fetch(root: Path) -> None:
+    fetch(f"file:{root.parent / SOURCE}", root, ["hop/random/none"], (2, 3), workers=1)
+
+
+def _publish(root: Path) -> None:
+    publish(root.parent / SOURCE, f"file:{root}", workers=1)
 
 
 TABLE: dict[str, tuple[list[Callable], Callable]] = {
@@ -49,8 +46,11 @@ TABLE: dict[str, tuple[list[Callable], Callable]] = {
     "paint": ([_light], _rollout),
     "growth": ([_rollout], _growth),
     "fetch": ([], _fetch),
+    "publish": ([], _publish),
+    "publish of what grew": ([_rollout], _publish),
 }
 """Name -> commands that ran before, and the command that is killed."""
+TIERS = {"fetch": pytest.mark.slow}
 
 
 @pytest.fixture(autouse=True)
@@ -58,39 +58,39 @@ def one_writer_of_metadata(monkeypatch):
     monkeypatch.setattr(writer, "READERS", 1)  # writes in one order, so that each has a number
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=TIERS.get(name, pytest.mark.full)) for name in TABLE])
 def test_a_killed_command_leaves_the_older_release_and_is_simply_run_again(tmp_path, name):
     strike_everywhere(tmp_path, name)
 
 
-def strike_everywhere(tmp_path: Path, name: str, step: int = 1) -> None:
-    """Kill a command before and after each of its writes (or every `step`-th), look, and run it once more.
+def strike_everywhere(tmp_path: Path, name: str) -> None:
+    """Kill a command before and after each of its writes, look, and run it once more.
 
     Raises:
       AssertionError, DmcvbError: a reader saw something else than the older or the newer release.
     """
     before, command = TABLE[name]
     made_up.make(open_store(tmp_path / SOURCE), made_up.recipe(5))
-    start = open_store(tmp_path / "start")
-    start.folder.mkdir()
+    start = tmp_path / "start"
+    start.mkdir()
     for each in before:
-        each(start, tmp_path)
-    shutil.copytree(start.folder, tmp_path / "whole")
-    counted = KillingStore(open_store(tmp_path / "whole"))
-    command(counted, tmp_path)
+        each(start)
+    shutil.copytree(start, tmp_path / "whole")
+    with pytest.MonkeyPatch.context() as patch:
+        writes = die(patch)
+        command(tmp_path / "whole")
     older, newer = (_digest(tmp_path / folder) for folder in ("start", "whole"))
-    for number in range(0, len(counted.writes), step):
+    for number, path in enumerate(writes):
         for after in (False, True):
             struck = tmp_path / f"{number}{'ab'[after]}"
-            shutil.copytree(start.folder, struck)
-            store = open_store(struck)
-            with pytest.raises(Killed):
-                command(KillingStore(store, number, after), tmp_path)
-            where = f"{name} killed {'after' if after else 'before'} {counted.writes[number]}"
+            shutil.copytree(start, struck)
+            with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+                die(patch, number, after)
+                command(struck)
+            where = f"{name} killed {'after' if after else 'before'} {path}"
             assert _seen(struck, name) in (older, newer), where
-            command(store, tmp_path)
-            assert _seen(struck, name) == newer, where
+            command(struck)
+            assert _seen(struck, name) == newer and not wrong_files(struck), where
             shutil.rmtree(struck)
 
 
@@ -128,49 +128,38 @@ def _record_before_files(monkeypatch):
 
 def _manifest_before_lists(monkeypatch):
     late: list = []
-    put, replace = writer.put, KillingStore.replace
+    put, replace = writer.put, Store.replace
 
     def later(store, path, data, **options):
         return late.append((store, path, data)) if path.startswith("layers/") else put(store, path, data, **options)
 
     def first(self, path, data, expected="*"):
         done = replace(self, path, data, expected)
-        if path == "manifest.json":
-            while late:
-                put(*late.pop())
+        while path == "manifest.json" and late:
+            put(*late.pop())
         return done
 
     monkeypatch.setattr(writer, "put", later)
-    monkeypatch.setattr(KillingStore, "replace", first)
-
-
-def _plain_metadata_first(monkeypatch):
-    finish = writer.finish
-
-    def early(store):
-        store.replace("hop/random.zarr/zarr.json", b"{}")
-        return finish(store)
-
-    monkeypatch.setattr(made_up, "finish", early)
+    monkeypatch.setattr(Store, "replace", first)
 
 
 def _manifest_of_all_that_was_asked_for(monkeypatch):
-    build = writer.build_manifest
+    build, finish = writer.build_manifest, writer.finish
 
     def eager(recipes, lists):
-        recipes = list(recipes)
         gaps = {name: (*records, *records[-1:] * 9) for name, records in lists.items()}
         return build(recipes, gaps)
 
+    def begin(store, wanted, inputs):
+        writer.begin(store, wanted, inputs)
+        finish(store)
+
     monkeypatch.setattr(writer, "build_manifest", eager)
-    monkeypatch.setattr(
-        made_up, "begin", lambda store, wanted, inputs: (writer.begin(store, wanted, inputs), finish(store))
-    )
-    finish = writer.finish
+    monkeypatch.setattr(made_up, "begin", begin)
 
 
 def _older_manifest_is_deleted_first(monkeypatch):
-    replace = KillingStore.replace
+    replace = Store.replace
 
     def unsafe(self, path, data, expected="*"):
         if path == "manifest.json" and expected not in (None, "*"):
@@ -178,40 +167,29 @@ def _older_manifest_is_deleted_first(monkeypatch):
             expected = None
         return replace(self, path, data, expected)
 
-    monkeypatch.setattr(KillingStore, "replace", unsafe)
+    monkeypatch.setattr(Store, "replace", unsafe)
 
 
 def _records_of_copies_before_files(monkeypatch):
-    files = gate.Shard.files.fget
-    monkeypatch.setattr(gate.Shard, "record_path", property(lambda self: files(self)[0].path))
-    monkeypatch.setattr(
-        gate.Shard,
-        "files",
-        property(lambda self: (FileAt(gate.record_path(self.layer.name, self.number)), *files(self))),
-    )
+    def bring_shards(self, shards):
+        self.bring([shard.record_file for shard in shards])
+        self.bring([file for shard in shards for file in shard.files])
 
-
-class FileAt:
-    """Anything with a path."""
-
-    def __init__(self, path: str):
-        self.path = path
+    monkeypatch.setattr(_Download, "bring_shards", bring_shards)
 
 
 MISTAKES = {
-    "record before files": (_record_before_files, "rollout"),
-    "manifest before lists": (_manifest_before_lists, "growth"),
-    "metadata for plain readers before the manifest": (_plain_metadata_first, "rollout"),
-    "a manifest of shards that are not there": (_manifest_of_all_that_was_asked_for, "growth"),
-    "the manifest is deleted before it is written": (_older_manifest_is_deleted_first, "growth"),
-    "a copy's record before its files": (_records_of_copies_before_files, "fetch"),
+    _record_before_files: "rollout",
+    _manifest_before_lists: "growth",
+    _manifest_of_all_that_was_asked_for: "growth",
+    _older_manifest_is_deleted_first: "publish of what grew",
+    _records_of_copies_before_files: "fetch",
 }
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.__name__)
 def test_the_crash_table_notices(tmp_path, monkeypatch, mistake):
-    make, row = MISTAKES[mistake]
-    make(monkeypatch)
+    mistake(monkeypatch)
     with pytest.raises((AssertionError, DmcvbError, FileNotFoundError)):
-        strike_everywhere(tmp_path, row)
+        strike_everywhere(tmp_path, MISTAKES[mistake])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import Copy, LayerList, Manifest, Resolved, ShardRecord, check_relative_path, parse
+from dmcvb_gen.dataset.manifest import Copy, FileRecord, LayerList, Manifest, Resolved, ShardRecord, parse
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.generate.render import renderer_for
 from dmcvb_gen.loaders.painted import Painting, painted_release
@@ -95,14 +95,14 @@ def test_arrays_take_numpys_indices_and_a_wrong_one_is_no_damage(small_release):
         np.testing.assert_array_equal(stored[index], whole[index])
     np.testing.assert_array_equal(stored[[]], whole[:0])
     for index in (7, [0, 99], [0.5], ["a"], 0.5, "a", None, np.array([True, False]), ([0, 2], [1, 2]), (0, 0, 0, 0)):
-        with pytest.raises(IndexError, match="StoredArray state"):
+        with pytest.raises(IndexError):
             stored[index]
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x", "a/../../b", "a//b", "", "a/./b", "c:\\x", "a/\x00"])
 def test_paths_that_leave_their_folder_are_refused(path):
-    with pytest.raises(ValueError, match="not a plain relative path"):
-        check_relative_path(path)
+    with pytest.raises(ValueError, match="should match pattern"):
+        FileRecord(path=path, bytes=1, sha256="0" * 64)
 
 
 @given(st.text())

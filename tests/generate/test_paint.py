@@ -13,8 +13,8 @@ from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.dataset.writer import finish_copy
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.paint import Wanted, paint_release
-from dmcvb_gen.release.verify import check_files
-from tests.conftest import invoke, maze_recipe, records, roll_out, small_recipe
+from dmcvb_gen.storage.store import open_store
+from tests.conftest import invoke, maze_recipe, records, roll_out, small_recipe, wrong_files
 
 SHORT = {"tasks": "walker-walk", "levels": "random", "episodes": 3, "episodes_per_shard": 2, "max_steps": 6}
 RECIPES = {
@@ -41,16 +41,13 @@ def copy_without_images(source, target):
     """What `fetch --no-pixels` leaves: all but the image layers' files and records, and copy.json."""
     release = Release.open(source)
     shutil.copytree(source, target)
-    promised = {}
     for name, layer in release.layers.items():
         if layer.kind == "images":
             shutil.rmtree(target / "records" / name)
             shutil.rmtree(target / layer.group / layer.arrays[0].stored_name)
-        else:
-            promised[name] = range(len(release.records(name)))
     (target / "manifest.json").unlink()
-    store = Release.in_making(Release.open(target).store).store
-    return finish_copy(store, (source / "manifest.json").read_bytes(), "there", promised)
+    store, text = open_store(target), (source / "manifest.json").read_bytes()
+    return finish_copy(store, text, "there", release.shards(images=False))
 
 
 def test_painting_a_light_release_gives_the_records_of_a_painted_one(made, light):
@@ -119,4 +116,4 @@ def test_a_copy_gains_images_of_another_size_and_keeps_its_digest(made, tmp_path
     assert arrays == (["at24/pixels_hidden_goal/top"] if maze else ["at24/pixels"])
     assert done.release[name].read(arrays[0]).shape[2:] == (24, 24, 3)
     assert done.release.digest == digest and Release.open(tmp_path / "copy")[name].read(arrays[0]).any()
-    assert not check_files(tmp_path / "copy")
+    assert not wrong_files(tmp_path / "copy")

@@ -7,10 +7,8 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import dmcvb_gen
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.regenerate import Regeneration
@@ -21,6 +19,7 @@ from dmcvb_gen.release.import_tfds import import_tfds
 from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
+from tests.conftest import invoke
 
 NAME = "walker-walk/random/static"
 
@@ -45,8 +44,8 @@ def imported(rlds, tmp_path_factory):
     target = root / "locomotion/walker_walk/random/static_medium"
     target.parent.mkdir(parents=True)
     shutil.copytree(rlds, target)
-    result = CliRunner().invoke(main, ["import", str(root / "locomotion"), "--out", str(root / "release")])
-    assert result.exit_code == 0 and f"{NAME}: 2 episodes" in result.output
+    done = invoke("import", root / "locomotion", "--out", root / "release", code=0)
+    assert f"{NAME}: 2 episodes" in done.output
     return root / "release"
 
 
@@ -67,42 +66,41 @@ def test_dmc_vbs_folders_are_imported_whole(imported, episodes):
 
 def test_an_imported_release_keeps_its_pictures(imported, tmp_path):
     """Nobody could paint them again."""
-    command = ["publish", str(imported), f"file:{tmp_path / 'there'}", "--no-pixels"]
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 2 and "publish it with them, without --no-pixels" in result.output
-    assert len(result.output.strip().splitlines()) == 1 and not (tmp_path / "there").exists()
-    assert not list(imported.parent.glob(".*-light*"))
+    refused = invoke("publish", imported, f"file:{tmp_path / 'there'}", "--no-pixels", code=2).output
+    assert "publish it with them, without --no-pixels" in refused and not (tmp_path / "there").exists()
     with pytest.raises(StoreError, match="was imported.*without paint"):
         dmcvb_gen.open(str(imported), paint=True)
 
 
-def check_imported_card(folder):
-    """Its card is written, fits, and claims nothing that it has not."""
+@pytest.mark.parametrize("family", ["locomotion", "mazes"])
+def test_the_card_of_imported_data_fits_and_claims_nothing_that_it_has_not(request, small_mazes, tmp_path, family):
+    folder = tmp_path / "r"
+    if family == "mazes":
+        import_tfds(request.getfixturevalue("dmcvb_mazes"), folder)
+    else:
+        shutil.copytree(request.getfixturevalue("imported"), folder)
     write_card(folder)
     assert check_card(folder) == []
     text, metadata = (folder / "README.md").read_text(), (folder / "croissant.json").read_text()
     assert "Imported by dmcvb-gen" in text and "those of the imported data" in text
-    for claim in ("regenerate", "full physics states", "`exogenous/`", "`physics`", "None samples", "seed None"):
+    for claim in ("regenerate", "full physics states", "`exogenous/`", "`physics`", "exogenous/style", "seed None"):
         assert claim not in text, claim
-    assert "exogenous/style" not in text
     assert "can be regenerated from them" not in metadata and "roll out" not in metadata
-
-
-def test_the_card_of_imported_locomotion(imported, tmp_path):
-    shutil.copytree(imported, tmp_path / "r")
-    check_imported_card(tmp_path / "r")
-
-
-def test_the_card_of_imported_mazes(dmcvb_mazes, small_mazes, tmp_path):
-    import_tfds(dmcvb_mazes, tmp_path / "r")
-    check_imported_card(tmp_path / "r")
-    share = Release.open(small_mazes)["ant-maze-tiny/random/fixed"].read("terminated").mean()
-    assert f"| `ant-maze-empty7x7/expert/fixed` | {share:.0%} |" in (tmp_path / "r/README.md").read_text()
+    if family == "mazes":
+        share = Release.open(small_mazes)["ant-maze-tiny/random/fixed"].read("terminated").mean()
+        assert f"| `ant-maze-empty7x7/expert/fixed` | {share:.0%} |" in text
 
 
 def test_damaged_or_foreign_folders_are_not_imported(rlds, tmp_path):
     with pytest.raises(StoreError, match="no features.json"):
         import_tfds(tmp_path, tmp_path / "r")
+    (tmp_path / "odd").mkdir()
+    steps = {"featuresDict": {"features": {"reward": [1, 2]}}}
+    tree = {"featuresDict": {"features": {"steps": {"sequence": {"feature": steps}}}}}
+    (tmp_path / "odd/features.json").write_text(json.dumps(tree))
+    with pytest.raises(StoreError, match="features.json does not describe RLDS steps"):
+        import_tfds(tmp_path / "odd", tmp_path / "r", task="walker-walk", level="expert", setting="none")
+    shutil.rmtree(tmp_path / "odd")
     shutil.copytree(rlds, tmp_path / "somewhere")
     with pytest.raises(StoreError, match="task, level"):
         import_tfds(tmp_path / "somewhere", tmp_path / "r")
@@ -157,56 +155,24 @@ def test_dmc_vbs_mazes_are_imported_by_the_names_of_their_fields(dmcvb_mazes, sm
     assert result.sound, result.findings
 
 
-def split_files(folder, count):
-    """The one TFRecord file of a folder as `count` files, an episode or none each; gives their paths."""
-    [whole] = folder.rglob("*.tfrecord-*")
-    data = [record(encode_example(read_example(whole, *place))) for place in offsets(whole)]
-    stem = whole.name.rsplit("-", 3)[0]
+def test_folders_that_lack_files_are_imported_only_when_asked(rlds, tmp_path):
+    place = "locomotion/walker_walk/random/static_medium"
+    shutil.copytree(rlds, tmp_path / place)
+    [whole] = (tmp_path / place).rglob("*.tfrecord-*")
+    data = [record(encode_example(read_example(whole, *episode))) for episode in offsets(whole)]
     whole.unlink()
-    files = [whole.with_name(f"{stem}-{number:05d}-of-{count:05d}") for number in range(count)]
-    for number, file in enumerate(files):
-        file.write_bytes(data[number] if number < len(data) else b"")
-    return files
-
-
-@pytest.mark.parametrize("family", ["locomotion", "mazes"])
-def test_folders_that_lack_files_are_imported_only_when_asked(rlds, dmcvb_mazes, tmp_path, family):
-    mazes = family == "mazes"
-    place = "antmaze_random_visible_goal/empty7x7/expert" if mazes else "locomotion/walker_walk/random/static_medium"
-    shutil.copytree(dmcvb_mazes / place if mazes else rlds, tmp_path / place)
-    files = split_files(tmp_path / place, 3)
-    for missing, out in ((files[0], "without_first"), (files[1], "without_second")):
-        hidden = missing.rename(tmp_path / "away")
-        number = files.index(missing)
-        command = ["import", str(tmp_path / place.split("/")[0]), "--out", str(tmp_path / out)]
-        refused = CliRunner().invoke(main, command)
-        assert refused.exit_code == 2 and f"2 of 3 files (number {number} is missing)" in refused.output
-        assert not (tmp_path / out).exists()
-        assert CliRunner().invoke(main, [*command, "--partial"]).exit_code == 0
-        again = CliRunner().invoke(main, [*command, "--partial"])
-        assert again.exit_code == 0 and "1 episode" in again.output
-        hidden.rename(missing)
-        before = (tmp_path / out / "manifest.json").read_bytes()
-        other = CliRunner().invoke(main, command)
-        assert other.exit_code == 2 and "choose another --out" in other.output
-        assert (tmp_path / out / "manifest.json").read_bytes() == before
-
-
-@pytest.mark.parametrize("family", ["locomotion", "mazes"])
-def test_an_import_has_the_time_limit_of_its_episodes(family, tmp_path):
-    if family == "mazes":
-        task, setting, place = "ant-maze-empty7x7", "--goal=hidden", "antmaze_random_hidden_goal/empty7x7/random"
-    else:
-        task, setting, place = "cheetah-run", "--distractor=static", "locomotion/cheetah_run/random/static_medium"
-    made = ["rollout", task, "--level=random", setting, "--episodes=2", "--max-steps=7", "--size=16"]
-    assert CliRunner().invoke(main, [*made, f"--out={tmp_path / 'made'}"]).exit_code == 0
-    [folder] = export(str(tmp_path / "made"), "rlds", tmp_path / "out")
-    (tmp_path / place).parent.mkdir(parents=True)
-    shutil.move(folder, tmp_path / place)
-    import_tfds(tmp_path / place.split("/")[0], tmp_path / "r")
-    assert [record.max_steps for record in Release.open(tmp_path / "r").manifest.subsets] == [7]
-    result = verify(tmp_path / "r")
-    assert result.sound, result.findings
+    for number, content in enumerate((*data, b"")):  # three files, an episode or none each
+        whole.with_name(f"{whole.name.rsplit('-', 3)[0]}-{number:05d}-of-00003").write_bytes(content)
+    [first] = (tmp_path / place).rglob("*-00000-of-*")
+    hidden = first.rename(tmp_path / "away")
+    command = ["import", tmp_path / "locomotion", "--out", tmp_path / "r"]
+    assert "2 of 3 files (number 0 is missing)" in invoke(*command, code=2).output and not (tmp_path / "r").exists()
+    for _ in range(2):
+        assert "1 episode" in invoke(*command, "--partial", code=0).output
+    hidden.rename(first)
+    before = (tmp_path / "r/manifest.json").read_bytes()
+    assert "choose another --out" in invoke(*command, code=2).output
+    assert (tmp_path / "r/manifest.json").read_bytes() == before
 
 
 def test_fixed_goals_of_unequal_numbers_of_episodes_are_all_found(dmcvb_mazes, small_mazes, tmp_path):
@@ -232,14 +198,6 @@ def test_folders_that_do_not_say_what_they_are_are_refused(dmcvb_mazes, tmp_path
     with pytest.raises(StoreError, match="no image observation/lowres_top_camera;"):
         import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="visible")
     import_tfds(tmp_path / "x", tmp_path / "r", **what, setting="hidden")
-
-
-def test_a_feature_that_is_none_is_refused_in_one_line(tmp_path):
-    steps = {"featuresDict": {"features": {"reward": [1, 2]}}}
-    tree = {"featuresDict": {"features": {"steps": {"sequence": {"feature": steps}}}}}
-    (tmp_path / "features.json").write_text(json.dumps(tree))
-    with pytest.raises(StoreError, match="features.json does not describe RLDS steps"):
-        import_tfds(tmp_path, tmp_path / "out", task="walker-walk", level="expert", setting="none")
 
 
 def test_fixed_goals_exported_to_rlds_keep_their_pairs(small_mazes, tmp_path):

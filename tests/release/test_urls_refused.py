@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.places import local_path
+from tests.conftest import invoke
 
 URL = "s3://bucket/x"
 COMMANDS = {
@@ -34,20 +33,16 @@ def elsewhere(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_no_command_makes_a_folder_of_a_url(small_release, elsewhere, name):
-    words = [str(small_release) if word == "RELEASE" else word for word in COMMANDS[name]]
-    result = CliRunner().invoke(main, words)
-    said = result.output.splitlines()[-1]
-    assert result.exit_code == 2 and "s3://bucket/x" in said and "give a local one" in said, result.output
+    words = [small_release if word == "RELEASE" else word for word in COMMANDS[name]]
+    said = invoke(*words, code=2).output.splitlines()[-1]
+    assert "s3://bucket/x" in said and "give a local one" in said
     assert not list(elsewhere.iterdir())
 
 
-@pytest.mark.parametrize("command", ["publish", "fetch"])
-def test_a_url_with_a_slash_too_few_is_no_folder(small_release, tmp_path, monkeypatch, command):
-    monkeypatch.chdir(tmp_path)
-    words = {"publish": [str(small_release), "s3:/bucket/demo"], "fetch": ["s3:/bucket/demo", "--out", "here"]}[command]
-    done = CliRunner().invoke(main, [command, *words])
-    assert done.exit_code == 2 and "did you mean s3://bucket/demo?" in done.output and done.output.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+def test_a_url_with_a_slash_too_few_is_no_folder(small_release, elsewhere):
+    for words in (["publish", small_release, "s3:/bucket/demo"], ["fetch", "s3:/bucket/demo", "--out", "here"]):
+        said = invoke(*words, code=2).output
+        assert "did you mean s3://bucket/demo?" in said and said.count("\n") == 1 and not list(elsewhere.iterdir())
 
 
 def test_what_is_no_url_is_a_path():

@@ -7,15 +7,13 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import RenderingError, StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.release.fetch import fetch
-from dmcvb_gen.release.verify import check_files, verify, verify_folder
-from tests.conftest import rewrite, roll_out, small_recipe
+from dmcvb_gen.release.verify import verify, verify_folder
+from tests.conftest import invoke, rewrite, roll_out, small_recipe, wrong_files
 
 NAME, MAZE = "walker-walk/random/dynamic", "ant-maze-tiny/random/visible"
 
@@ -38,26 +36,12 @@ def test_a_sound_release_passes(release, counts, request):
     result = verify(folder)
     assert result.sound and result.complete and {**result.checked, **counts} == result.checked
     assert result.digest == sha256_file(folder / "manifest.json") and not result.compared
-    done = CliRunner().invoke(main, ["verify", f"{folder}@sha256:{result.digest}"])
-    assert done.exit_code == 0 and "All checks passed" in done.output and "not compared" not in done.output
-    wrong = CliRunner().invoke(main, ["verify", f"{folder}@sha256:{'0' * 64}"])
-    assert wrong.exit_code == 2 and f"is release {result.digest}, not 0000" in wrong.output
+    said = invoke("verify", f"{folder}@sha256:{'0' * 64}", code=2).output
+    assert f"is release {result.digest}, not 0000" in said
 
 
 def swap_rewards(arrays):
     arrays["reward"][0, :500] = np.roll(arrays["reward"][0, :500], 7)  # the return stays the same
-
-
-def swap_pixels(arrays):
-    arrays["pixels"][1] = arrays["pixels"][0]
-
-
-def spoil_state(arrays):
-    arrays["state"][2, 123, 4] = np.nan
-
-
-def inflate_return(arrays):
-    arrays["return"][1] += 100
 
 
 def duplicate(arrays):
@@ -65,41 +49,34 @@ def duplicate(arrays):
         arrays[name][2] = arrays[name][0]
 
 
-def repeat_actions(arrays):
-    arrays["action"][2] = arrays["action"][0]
-
-
-def wild_action(arrays):
-    arrays["action"][1, 7, 0] = 1.5
-
-
-def cut_length(arrays):
-    arrays["length"][1] = 0
+def put(name, place, value):
+    """A change of one number."""
+    return lambda arrays: arrays[name].__setitem__(place, value)
 
 
 DAMAGE = {
-    swap_rewards: {"rewards", 0},
-    swap_pixels: {"pixels", 1},
-    spoil_state: {"finite", 2, 123},
-    inflate_return: {"returns", 1},
-    duplicate: {"duplicates", 2},
-    wild_action: {"actions", 1, 7},
-    cut_length: {"lengths", 1},
+    "rewards in another order": (swap_rewards, {"rewards", 0}),
+    "pixels of another episode": (lambda arrays: put("pixels", 1, arrays["pixels"][0])(arrays), {"pixels", 1}),
+    "a state that is none": (put("state", (2, 123, 4), np.nan), {"finite", 2, 123}),
+    "another return": (put("return", 1, 100), {"returns", 1}),
+    "an episode twice": (duplicate, {"duplicates", 2}),
+    "a wild action": (put("action", (1, 7, 0), 1.5), {"actions", 1, 7}),
+    "no length": (put("length", 1, 0), {"lengths", 1}),
 }
-"""What is done to the arrays -> the check that finds it, the episode, and the step where that is known."""
+"""What is done to the arrays, the check that finds it, the episode, and the step where that is known."""
 
 
-@pytest.mark.parametrize("change", DAMAGE, ids=lambda change: change.__name__)
-def test_wrong_values_are_found_by_their_check(copy, change):
+@pytest.mark.parametrize("name", DAMAGE)
+def test_wrong_values_are_found_by_their_check(copy, name):
+    change, place = DAMAGE[name]
     rewrite(copy, NAME, change)
     found = verify_folder(copy, names=[NAME]).findings
-    places = [{finding.check, finding.episode, finding.step} for finding in found]
-    assert any(DAMAGE[change] <= place for place in places), found
+    assert any(place <= {finding.check, finding.episode, finding.step} for finding in found), found
     assert {finding.subset for finding in found} == {NAME}
 
 
 def test_equal_actions_alone_are_no_duplicate(copy):
-    rewrite(copy, NAME, repeat_actions)
+    rewrite(copy, NAME, lambda arrays: put("action", 2, arrays["action"][0])(arrays))
     assert not any(finding.check == "duplicates" for finding in verify_folder(copy, names=[NAME]).findings)
 
 
@@ -110,7 +87,7 @@ def test_returns_of_longer_episodes_may_be_higher(tmp_path):
     assert verify(tmp_path / "long").sound
     [policy] = (tmp_path / "long/policies").iterdir()
     policy.write_bytes(policy.read_bytes()[:-1] + b"x")
-    [found] = check_files(tmp_path / "long")
+    [found] = wrong_files(tmp_path / "long")
     assert found.subset == f"policies/{policy.name}" and "does not have its digest" in found.message
 
 
@@ -119,31 +96,28 @@ def test_what_this_machine_cannot_check_is_not_called_damaged(copy, monkeypatch)
         raise RenderingError("no renderer here")
 
     monkeypatch.setattr("dmcvb_gen.release.contents.renderer_for", fail)
-    result = CliRunner().invoke(main, ["verify", str(copy)])
-    assert result.exit_code == 3 and "NOT CHECKED walker-walk" in result.output and "regenerate" not in result.output
+    said = invoke("verify", copy, code=3).output
+    assert "NOT CHECKED walker-walk" in said and "regenerate" not in said
 
 
 def test_a_damaged_layer_is_named_with_its_cure_and_its_values_are_not_read(copy):
     path = next(copy.rglob("random.zarr/dynamic/pixels/c/*/0/0/0/0"))
     path.write_bytes(path.read_bytes()[:100])
-    done = CliRunner().invoke(main, ["verify", str(copy), "--json"])
-    facts = json.loads(done.output)
-    assert done.exit_code == 1 and facts["checked"]["subsets"] == 2
+    facts = json.loads(invoke("verify", copy, "--json", code=1).output)
+    assert facts["checked"]["subsets"] == 2
     [finding] = facts["findings"]
     assert finding["subset"] == f"{NAME}/pixels" and "has 100 bytes instead of" in finding["message"]
-    assert "`dmcvb-gen regenerate" in CliRunner().invoke(main, ["verify", str(copy)]).output
+    assert "`dmcvb-gen regenerate" in invoke("verify", copy).output
 
 
 @pytest.mark.parametrize(("release", "name", "here"), [("small_release", NAME, 2), ("maze_release", MAZE, 1)])
 def test_a_part_of_a_release_is_called_incomplete(release, name, here, request, tmp_path):
     source = request.getfixturevalue(release)
     fetch(f"file:{source}", tmp_path / "part", [name], (0, 1))
-    result = CliRunner().invoke(main, ["verify", str(tmp_path / "part")])
-    planned = Release.open(source)[name].record.episodes
-    assert result.exit_code == 3 and f"{name}: {here} of {planned} episodes" in result.output, result.output
-    assert "incomplete:" in result.output and "not compared" not in result.output
-    others = [other for other in Release.open(source) if other != name]
-    for other in others:
+    said = invoke("verify", tmp_path / "part", code=3).output
+    assert f"{name}: {here} of {Release.open(source)[name].record.episodes} episodes" in said
+    assert "incomplete:" in said and "not compared" not in said
+    for other in {*Release.open(source)} - {name}:
         with pytest.raises(StoreError, match="has no episode of it"):
             Release.open(tmp_path / "part")[other]
 
@@ -152,9 +126,9 @@ def test_files_that_no_digest_speaks_of_are_named(copy):
     for path in ("preview/sheet.png", "README.md", "card/returns.png"):  # where commands write
         (copy / path).parent.mkdir(exist_ok=True)
         (copy / path).write_bytes(b"x")
-    assert not check_files(copy)
+    assert not wrong_files(copy)
     strange = {"notes.txt", "policies/other.safetensors"}
     for path in strange:
         (copy / path).parent.mkdir(exist_ok=True)
         (copy / path).write_bytes(b"stray")
-    assert {(issue.subset, issue.check) for issue in check_files(copy)} == {(path, "files") for path in strange}
+    assert {(issue.subset, issue.check) for issue in wrong_files(copy)} == {(path, "files") for path in strange}

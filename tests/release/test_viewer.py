@@ -10,14 +10,12 @@ import subprocess
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import dmcvb_gen
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.viewer import view
-from tests.conftest import roll_out, small_recipe
+from tests.conftest import invoke, roll_out, small_recipe
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
@@ -94,8 +92,7 @@ def drive(page):
 
 @needs_browser
 @pytest.mark.slow
-@pytest.mark.parametrize("light", [False, True], ids=["painted", "light"])
-@pytest.mark.parametrize("family", ["small_release", "small_mazes"])
+@pytest.mark.parametrize(("family", "light"), [("small_release", True), ("small_mazes", False)])
 def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_path):
     source = folder = request.getfixturevalue(family)
     if light:
@@ -135,45 +132,38 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
         ]
 
 
-@pytest.mark.slow
-def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(small_release, maze_release, tmp_path):
-    for folder in (small_release, maze_release):
-        whole = view(str(folder), tmp_path / "whole.html", episodes=1, size=16)
-        small = view(str(folder), tmp_path / "small.html", episodes=1, max_mb=whole.bytes * 3 / 4e6)
-        assert whole.stride == 1 and small.stride > 1 and small.bytes <= whole.bytes * 3 / 4
-        with pytest.raises(StoreError, match="do not fit"):
-            view(str(folder), tmp_path / "none.html", max_mb=0.001)
-    for option in (dict(max_mb=0), dict(episodes=0), dict(episodes=-1), dict(episodes=1.5)):
-        with pytest.raises(DmcvbError, match=f"^{next(iter(option))} is .*: input should be "):
-            view(str(small_release), tmp_path / "none.html", **option)
+def page_data(path):
+    return json.loads(re.search(r'id="data">(.*?)</script>', path.read_text())[1])["episodes"]
+
+
+def test_a_small_limit_leaves_pictures_out_evenly_and_says_so(maze_release, tmp_path):
+    whole = view(str(maze_release), tmp_path / "whole.html", episodes=1, size=16)
+    small = view(str(maze_release), tmp_path / "small.html", episodes=1, max_mb=whole.bytes * 3 / 4e6)
+    assert whole.stride == 1 and small.stride > 1 and small.bytes <= whole.bytes * 3 / 4
+    with pytest.raises(StoreError, match="do not fit"):
+        view(str(maze_release), tmp_path / "none.html", max_mb=0.001)
 
 
 def test_the_command_writes_and_refuses(small_release, tmp_path):
-    command = ["view", str(small_release), "--only", "*/none", "--episodes", "1", "--size", "24"]
-    result = CliRunner().invoke(main, [*command, "--out", str(tmp_path / "v.html")])
-    assert result.exit_code == 0 and "1 episode of 1 subset" in result.output
-    data = re.search(r'id="data">(.*?)</script>', (tmp_path / "v.html").read_text())[1]
-    [episode] = json.loads(data)["episodes"]
-    assert episode["views"][0]["width"] == 24 and "--range 0:1" in data
+    command = ["view", small_release, "--only", "*/none", "--episodes", 1, "--size", 24]
+    said = invoke(*command, "--out", tmp_path / "v.html", code=0).output
+    [episode] = page_data(tmp_path / "v.html")
+    assert "1 episode of 1 subset" in said and episode["views"][0]["width"] == 24
     with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
         view(str(small_release), only=["cheetah-run"])
     with pytest.raises(StoreError, match="say with out where"):
         view("s3://bucket/release")
+    for option in (dict(max_mb=0), dict(episodes=0), dict(episodes=1.5)):
+        with pytest.raises(DmcvbError, match=f"^{next(iter(option))} is .*: input should be "):
+            view(str(small_release), tmp_path / "none.html", **option)
 
 
 def test_lamps_have_curves_and_a_url_the_command_that_fetches(tmp_path):
-    pattern = {
-        "tasks": "walker-walk",
-        "levels": "random",
-        "settings": "dynamic_camera0.2-light0.2",
-        "episodes": 1,
-        "max_steps": 3,
-    }
-    roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "lamps")
-    here = view(str(tmp_path / "lamps"), tmp_path / "here.html").path.read_text()
-    assert (
-        all(f"light_shift {axis}" in here for axis in "xyz")
-        and f"dmcvb-gen regenerate {tmp_path / 'lamps'} --only" in here
-    )
-    there = view(f"file://{tmp_path / 'lamps'}", tmp_path / "there.html").path.read_text()
-    assert f"dmcvb-gen fetch file://{tmp_path / 'lamps'} --only" in there and "dmcvb-gen regenerate" not in there
+    pattern = {"tasks": "walker-walk", "levels": "random", "episodes": 1, "max_steps": 3}
+    pattern |= {"settings": "dynamic_camera0.2-light0.2"}
+    folder = roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "lamps").path
+    for place, command in ((folder, f"regenerate {folder}"), (f"file://{folder}", f"fetch file://{folder}")):
+        [episode] = page_data(view(str(place), tmp_path / "page.html").path)
+        names = {curve["name"] for curve in episode["curves"]["distractor"]}
+        assert {f"light_shift {axis}" for axis in "xyz"} <= names
+        assert episode["command"].startswith(f"dmcvb-gen {command} --only ")

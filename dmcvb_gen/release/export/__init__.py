@@ -91,7 +91,7 @@ def export(
     others = [name for name in asked if name not in unions]
     names = [*(source.select(others) if others or not unions else ()), *unions]
     chosen = tuple((name, _episodes(source[name], episode_range)) for name in names)
-    folders = [folder] if merge else [folder / kind.folder_name(source, name) for name in names]
+    folders = [folder] if merge else [folder / kind.folder_name(name) for name in names]
     works = [
         _Work(path, storage_options, to, part, place, _stamp(source, to, part))
         for part, place in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)

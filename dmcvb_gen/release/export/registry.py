@@ -2,7 +2,7 @@
 
 A format of your own is a function with a decorator, and a line in your package's pyproject.toml::
 
-    @register_exporter("returns", reader="anybody", keeps="returns", drops="all else", mark="returns.txt")
+    @register_exporter("returns", mark="returns.txt")
     def write(source: Source, folder: Path) -> None:
         returns = [str(episode.reward.sum()) for episode in source]
         (folder / "returns.txt").write_text("\\n".join(returns))
@@ -17,15 +17,9 @@ import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.registry import Registry
-
-
-def subset_folder(release: Release, subset: str) -> str:
-    """Default folder of a subset's export below `--out`: its name."""
-    return subset
 
 
 @dataclass(frozen=True)
@@ -35,23 +29,18 @@ class Format:
     Attributes:
       name: name for `--to`.
       write: writes a subset (`Source`) to an empty folder; a list of subsets if the format `merges` them.
-      reader: the program that reads it.
-      keeps, drops: which parts of a subset it contains and which it leaves out, in words.
       mark: pattern of a file that only this format has.
       modules: modules that it imports beyond dmcvb-gen's own dependencies.
       merges: whether one export can have several subsets (`--merge`).
-      folder_name: (release, subset) -> folder below `--out`.
+      folder_name: subset -> folder below `--out`; its name by default.
     """
 
     name: str
     write: Callable
-    reader: str
-    keeps: str
-    drops: str
     mark: str
     modules: tuple[str, ...] = ()
     merges: bool = False
-    folder_name: Callable[[Release, str], str] = subset_folder
+    folder_name: Callable[[str], str] = str
 
     def check_installed(self) -> None:
         """Raises DmcvbError if a package that the format needs is not installed."""

@@ -29,15 +29,7 @@ EPISODES_PER_FILE = 50
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
-@register_exporter(
-    "lerobot",
-    reader="LeRobot v3 (Parquet with PNG images), `datasets.load_dataset`",
-    keeps="pixels, states, actions, rewards, ends; depth, segmentation (16-bit images), flow",
-    drops="the last observation of each episode, physics, labels",
-    mark="meta/info.json",
-    modules=("pyarrow",),
-    merges=True,
-)
+@register_exporter("lerobot", mark="meta/info.json", modules=("pyarrow",), merges=True)
 def write(sources: Sequence[Source], folder: Path) -> None:
     """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/` and a card.
 
@@ -121,14 +113,9 @@ def _card(layout: _Layout) -> str:
 def _task_texts(sources: Sequence[Source]) -> list[str]:
     """A text of each source: task and level, and the setting if they have several."""
     subsets = [source.subset for source in sources]
-    settings: dict[tuple[str, str], set[str]] = {}
-    for subset in subsets:
-        settings.setdefault((subset.task, subset.level), set()).add(subset.record.setting)
-    told = [len(settings[subset.task, subset.level]) > 1 for subset in subsets]
-    return [
-        f"{subset.task} ({subset.level}{f', {subset.record.setting}' if more else ''})"
-        for subset, more in zip(subsets, told, strict=True)
-    ]
+    short = [f"{subset.task} ({subset.level})" for subset in subsets]
+    several = len(set(short)) < len(subsets)
+    return [f"{s.task} ({s.level}, {s.setting})" for s in subsets] if several else short
 
 
 class _Layout:
@@ -249,10 +236,14 @@ class _Files:
 
     def add(self, columns: dict[str, np.ndarray], number: int) -> dict[str, Any]:
         """Write an episode; gives where it is, as columns of the table of episodes."""
+        import pyarrow.parquet as pq
+
         chunk, file = divmod(number // EPISODES_PER_FILE, CHUNK_FILES)
         if number % EPISODES_PER_FILE == 0:
             self.close()
-            self._open(chunk, file)
+            path = self._folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._table = pq.ParquetWriter(path, self._schema)
         self._table.write_table(self._rows(columns))
         return {"data/chunk_index": chunk, "data/file_index": file}
 
@@ -270,18 +261,10 @@ class _Files:
             arrays.append(pa.FixedSizeListArray.from_arrays(flat, field.type.list_size) if many else flat)
         return pa.table(arrays, schema=self._schema)
 
-    def _open(self, chunk: int, file: int) -> None:
-        import pyarrow.parquet as pq
-
-        path = self._folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._table = pq.ParquetWriter(path, self._schema)
-
     def close(self) -> None:
-        """End the files that are open."""
+        """End the file that is open."""
         if self._table is not None:
             self._table.close()
-        self._table = None
 
 
 class _Statistics:

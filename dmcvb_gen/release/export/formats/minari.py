@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dmcvb_gen import files
-from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.loaders.register import ENTRY_POINT, NAMESPACE, environment_id
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source
 from dmcvb_gen.release.export.registry import register_exporter
@@ -22,21 +21,13 @@ if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
 
-def folder_name(release: Release, subset: str) -> str:
+def folder_name(subset: str) -> str:
     """Return the id of a subset's data set, which is also its folder below the root of minari's data sets."""
     task, level, setting = subset.replace("_", "-").replace(".", "-").split("/")
     return f"{NAMESPACE}/{task}/{level}-{setting}-v0"
 
 
-@register_exporter(
-    "minari",
-    reader="minari (`MINARI_DATASETS_PATH=<out>`; HDF5 storage, lossless images)",
-    keeps="pixels, states, actions, rewards, ends, seeds, the Gymnasium environment",
-    drops="physics, labels",
-    mark="data/main_data.hdf5",
-    modules=("minari", "h5py"),
-    folder_name=folder_name,
-)
+@register_exporter("minari", mark="data/main_data.hdf5", modules=("minari", "h5py"), folder_name=folder_name)
 def write(source: Source, folder: Path) -> None:
     """Write `<folder>/data`, and what minari keeps of the namespaces above it.
 
@@ -49,7 +40,7 @@ def write(source: Source, folder: Path) -> None:
     from dmcvb_gen.generate.references import reference_returns
 
     subset, size = source.subset, source.subset.record.size
-    name = folder_name(source.release, subset.name)
+    name = folder_name(subset.name)
     picture = spaces.Box(0, 255, (size, size, 3 * len(source.views)), np.uint8)
     state = spaces.Box(-np.inf, np.inf, (subset.array("state").shape[-1],), np.float32)
     storage = MinariStorage.new(

@@ -15,13 +15,7 @@ CHUNK = 161
 """Steps a chunk."""
 
 
-@register_exporter(
-    "replay-buffer",
-    reader="diffusion policy's `ReplayBuffer` (Zarr 2: `data/img`, `data/state`, `data/action`, `meta/episode_ends`)",
-    keeps="pixels, states, actions, rewards; depth, segmentation, flow",
-    drops="the last observation of each episode, discounts, physics, labels",
-    mark="replay_buffer.zarr/.zgroup",
-)
+@register_exporter("replay-buffer", mark="replay_buffer.zarr/.zgroup")
 def write(source: Source, folder: Path) -> None:
     """Write `replay_buffer.zarr`: `data/img` (step, height, width, 3) uint8 (`data/img_<view>` for several views),
     `data/state`, `data/action`, `data/reward` float32, stored modalities (`data/depth`), and `meta/episode_ends` int64.

@@ -16,15 +16,7 @@ EPISODES_PER_FILE = 50
 _FEATURES = "tensorflow_datasets.core.features"
 
 
-@register_exporter(
-    "rlds",
-    reader=(
-        "TensorFlow Datasets (`tfds.builder_from_directory`): RLDS steps, PNG, state fields also under DMC-VB's names"
-    ),
-    keeps="pixels, states, actions, rewards, discounts, ends",
-    drops="physics, labels",
-    mark="dataset_info.json",
-)
+@register_exporter("rlds", mark="dataset_info.json")
 def write(source: Source, folder: Path) -> None:
     """Write `<version>/`: `dataset_info.json`, `features.json` and the TFRecord shards of a split "train".
 

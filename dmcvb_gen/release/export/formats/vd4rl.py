@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.release.export.episodes import ExportEpisode, Source
+from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import register_exporter
 
 FIRST, MID, LAST = 0, 1, 2
@@ -24,28 +24,14 @@ def _step_types(rows: int) -> np.ndarray:
     return types
 
 
-@register_exporter(
-    "hdf5",
-    reader="V-D4RL's DrQ+BC loader (`observation`, `action`, `reward`, `discount`, `step_type`)",
-    keeps="pixels (channels first), states, actions, rewards, discounts; depth, segmentation, flow",
-    drops="physics, labels, seeds",
-    mark="data_*.hdf5",
-    modules=("h5py",),
-)
+@register_exporter("hdf5", mark="data_*.hdf5", modules=("h5py",))
 def write_hdf5(source: Source, folder: Path) -> None:
     """Write `data_000.hdf5`, ...: `observation` (row, 3 * view, height, width) uint8, `action`, `reward`, `discount`,
     `state` float32 and `step_type`, episodes one after the other; stored `depth`, `segmentation`, `flow` as well. The
     attributes name the entries of state and action, and the joints."""
     import h5py
 
-    file: Any = None
-    written = 0
-    for episode in source:
-        if written % EPISODES_PER_FILE == 0:
-            if file:
-                file.close()
-            file = h5py.File(folder / f"data_{written // EPISODES_PER_FILE:03d}.hdf5", "w")
-            file.attrs.update({"description": source.description, "joints": source.joints})
+    for number, episode in enumerate(source):
         values = {
             "observation": episode.stacked().transpose(0, 3, 1, 2),
             **episode.arrived(),
@@ -53,13 +39,12 @@ def write_hdf5(source: Source, folder: Path) -> None:
             "step_type": _step_types(episode.length + 1),
             **episode.named_modalities(),
         }
-        for name, value in values.items():
-            _append(file, name, value)
-        for name, entries in source.names.items():
-            file[name].attrs["names"] = entries
-        written += 1
-    if file:
-        file.close()
+        with h5py.File(folder / f"data_{number // EPISODES_PER_FILE:03d}.hdf5", "a") as file:
+            file.attrs.update({"description": source.description, "joints": source.joints})
+            for name, value in values.items():
+                _append(file, name, value)
+            for name, entries in source.names.items():
+                file[name].attrs["names"] = entries
 
 
 def _append(file, name: str, value: np.ndarray) -> None:
@@ -73,30 +58,14 @@ def _append(file, name: str, value: np.ndarray) -> None:
     file[name][before:] = value
 
 
-@register_exporter(
-    "npz",
-    reader=(
-        "V-D4RL's DreamerV2 loader (`image`, `action`, `reward`, `discount`, `is_first`, `is_last`, `is_terminal`)"
-    ),
-    keeps="pixels, states, actions, rewards, discounts; depth, segmentation, flow",
-    drops="physics, labels, seeds",
-    mark="[0-9]*-[0-9]*.npz",
-)
+@register_exporter("npz", mark="[0-9]*-[0-9]*.npz")
 def write_npz(source: Source, folder: Path) -> None:
     """Write `<episode>-<rows>.npz`: `image` (row, height, width, 3 * view) uint8, `action`, `reward`, `discount`,
     `state` float32, `is_first`, `is_last`, `is_terminal` bool; `depth`, `segmentation`, `flow` if they are stored."""
     for episode in source:
-        rows = episode.length + 1
-        arrays: dict[str, Any] = _flags(episode) | _arrays(episode)
-        np.savez_compressed(folder / f"{episode.index:06d}-{rows}.npz", **arrays)
-
-
-def _arrays(episode: ExportEpisode) -> dict[str, np.ndarray]:
-    arrays = {"image": episode.stacked(), "state": episode.state, **episode.arrived()}
-    return arrays | episode.named_modalities()
-
-
-def _flags(episode: ExportEpisode) -> dict[str, np.ndarray]:
-    types = _step_types(episode.length + 1)
-    last = types == LAST
-    return {"is_first": types == FIRST, "is_last": last, "is_terminal": last & episode.terminated}
+        types = _step_types(episode.length + 1)
+        arrays: dict[str, Any] = {"is_first": types == FIRST, "is_last": types == LAST}
+        arrays |= {"is_terminal": arrays["is_last"] & episode.terminated}
+        arrays |= {"image": episode.stacked(), "state": episode.state}
+        arrays |= episode.arrived() | episode.named_modalities()
+        np.savez_compressed(folder / f"{episode.index:06d}-{len(types)}.npz", **arrays)

@@ -13,13 +13,7 @@ from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import register_exporter
 
 
-@register_exporter(
-    "zarr",
-    reader='zarr and xarray (`xarray.open_zarr(".../data.zarr")`): one Zarr v3 group',
-    keeps="all arrays: pixels, states, actions, rewards, discounts, ends, seeds, physics, labels, modalities",
-    drops="policies, videos",
-    mark="data.zarr/zarr.json",
-)
+@register_exporter("zarr", mark="data.zarr/zarr.json")
 def write(source: Source, folder: Path) -> None:
     """Write `data.zarr` with every array of the subset, (episode, step, ...) or (episode,); "/" in names becomes "_".
 
