@@ -18,14 +18,11 @@ class FakeHub:
 
     Attributes:
       commits: the paths of each commit. tags: name -> commit.
-      fail: the number of the commit that a lost connection keeps from being made.
-      asked: paths that were downloaded, with the revision.
     """
 
     def __init__(self, root: Path, repository: str):
         self.root, self.folder = root, root / "datasets" / repository
-        self.commits, self.tags, self.fail, self.asked = [], {}, None, []
-        self.endpoint = ""
+        self.commits, self.tags, self.endpoint = [], {}, ""
 
     @property
     def files(self) -> dict[str, bytes]:
@@ -66,32 +63,22 @@ class FakeHub:
         blob = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
         return types.SimpleNamespace(path=path, blob_id=blob, lfs=None, size=len(data))
 
-    def hf_hub_download(self, repo_id, filename, repo_type, revision, local_dir):
-        self.asked.append((filename, revision))
-        target = Path(local_dir) / filename
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(self.folder / filename, target)
-        return str(target)
-
     def create_tag(self, repo_id, tag, tag_message, revision, repo_type, exist_ok):
         assert exist_ok and revision == str(len(self.commits))
         self.tags.setdefault(tag, revision)
 
     def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit=None):
-        if self.fail is not None and len(self.commits) == self.fail:
-            raise ConnectionError("the line went dead, token=hf_secret123")
-        if parent_commit in (None, str(len(self.commits))):
-            shutil.copytree(self.folder, self.root / "commits" / str(len(self.commits)))
-            for operation in operations:
-                path = self.folder / operation.path_in_repo
-                if not hasattr(operation, "as_file"):
-                    path.unlink()
-                    continue
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with operation.as_file() as file:
-                    path.write_bytes(file.read())
-        else:
+        if parent_commit not in (None, str(len(self.commits))):
             raise RuntimeError("412 Precondition Failed: a commit has happened since")
+        shutil.copytree(self.folder, self.root / "commits" / str(len(self.commits)))
+        for operation in operations:
+            path = self.folder / operation.path_in_repo
+            if not hasattr(operation, "as_file"):
+                path.unlink()
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with operation.as_file() as file:
+                path.write_bytes(file.read())
         self.commits.append([operation.path_in_repo for operation in operations])
         return types.SimpleNamespace(oid=str(len(self.commits)))
 

@@ -91,20 +91,15 @@ def test_pages_stay_short():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_what_a_page_does_not_run_is_set_up_or_layout(page):
+def test_a_page_has_layouts_set_up_and_files_of_the_repository_beside_what_it_runs(page):
     for block in blocks(page):
-        assert block.language in RUN | SHOWN, f"{page.name}:{block.line}: {block.language}"
+        where = f"{page.name}:{block.line}"
+        assert block.language in RUN | SHOWN, where
         if block.language == "console":
             commands = [line for line in block.code.splitlines() if line.strip() and not line.startswith("#")]
-            assert all(line.startswith(SET_UP) for line in commands), f"{page.name}:{block.line}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_file_that_a_page_shows_is_included_from_the_repository(page):
-    for block in blocks(page):
+            assert all(line.startswith(SET_UP) for line in commands), where
         if block.file:
-            assert block.code == SNIPPET.format(block.file), f"{page.name}:{block.line}"
-            assert (ROOT / block.file).is_file()
+            assert block.code == SNIPPET.format(block.file) and (ROOT / block.file).is_file(), where
 
 
 def test_the_pages_show_every_example():

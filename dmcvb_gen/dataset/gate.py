@@ -35,6 +35,7 @@ from dmcvb_gen.dataset.manifest import (
     SubsetRecord,
     canonical_json,
     check_record,
+    file_of,
     layer_order,
     list_bytes_limit,
     list_path,
@@ -86,7 +87,7 @@ class Shard:
     @property
     def record_file(self) -> FileRecord:
         """The file that its record is in."""
-        return FileRecord.of(self.record_path, canonical_json(self.record))
+        return file_of(self.record_path, canonical_json(self.record))
 
 
 class Release:
@@ -364,10 +365,10 @@ def _with_own_images(store: Store, manifest: Manifest) -> Manifest:
     """The manifest, with image layers that recipes beside it add to its subsets: rendered in part, or in a copy."""
     layers: dict[str, Layer] = {layer.name: layer for layer in manifest.layers}
     subsets = {subset.name: subset for subset in manifest.subsets}
-    for digest in _recipes_at(store):
-        recipe = read_recipe(store, digest) if digest not in manifest.recipes else None
-        for subset in recipe.subsets if recipe else ():
-            added = {layer.name: layer for layer in recipe.layers if layer.name in subset.layers}  # type: ignore[union-attr]
+    others = [digest for digest in _recipes_at(store) if digest not in manifest.recipes]
+    for recipe in (read_recipe(store, digest) for digest in others):
+        for subset in recipe.subsets:
+            added = {layer.name: layer for layer in recipe.layers if layer.name in subset.layers}
             below = [layer for name, layer in added.items() if layer.kind != "images"]
             if subset.name in subsets and all(
                 layers[each.name].key == each.key for each in below if each.name in layers

@@ -67,10 +67,10 @@ class FileRecord(_Model):
     bytes: int = pydantic.Field(ge=0)
     sha256: Digest
 
-    @classmethod
-    def of(cls, path: str, data: bytes) -> FileRecord:
-        """The record of a file with these bytes."""
-        return cls(path=path, bytes=len(data), sha256=sha256_bytes(data))
+
+def file_of(path: str, data: bytes) -> FileRecord:
+    """The record of a file with these bytes."""
+    return FileRecord(path=path, bytes=len(data), sha256=sha256_bytes(data))
 
 
 # -- layers and their records ---------------------------------------------------------------------
@@ -516,7 +516,7 @@ def _difference(one: Layer, other: Layer) -> str:
     field, first, second = next((name, *pair) for name, pair in pairs.items() if pair[0] != pair[1])
     images = field == "arrays" and other.kind == "images"
     paint = f"add these images with `paint --size {other.arrays[0].shape[0]}`, or " if images else ""
-    return f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; {paint}choose another --out"
+    return f"{one.name} has {field} {shortened(first)}, asked for {shortened(second)}; {paint}choose another --out"
 
 
 def _arrays(one: Layer, other: Layer) -> str:
@@ -525,7 +525,8 @@ def _arrays(one: Layer, other: Layer) -> str:
     return ", ".join(f"{spec.name} of {spec.dtype} {list(spec.shape)}" for spec in mine) or "no others"
 
 
-def _short(value: Any) -> str:
+def shortened(value: Any) -> str:
+    """A value for a message, cut after 80 characters."""
     text = str(value)
     return text if len(text) < 80 else text[:77] + "..."
 
@@ -619,7 +620,7 @@ def _merged(one: SubsetRecord, other: SubsetRecord) -> SubsetRecord:
         first, second = getattr(one, field), getattr(other, field)
         if field not in ("episodes", "layers") and first != second:
             raise StoreError(
-                f"{one.name} has {field} {_short(first)}, asked for {_short(second)}; choose another --out"
+                f"{one.name} has {field} {shortened(first)}, asked for {shortened(second)}; choose another --out"
             )
     layers = tuple(sorted({*one.layers, *other.layers}, key=layer_order))
     return one.model_copy(update={"episodes": max(one.episodes, other.episodes), "layers": layers})

@@ -53,19 +53,17 @@ PIXEL_CHUNK_STEPS = 32
 def trajectory_arrays(task: Any) -> tuple[ArraySpec, ...]:
     """The arrays of a set of trajectories of a `dmcvb_gen.tasks` task (which this package does not import)."""
     fields = {name: [part.start, part.stop] for name, part in task.state_slices.items()}
-    bounds = {"low": [*map(float, task.action_low)], "high": [*map(float, task.action_high)]}
-    physics = dict(task.array_attributes.get("physics", {}))
-    action = len(task.action_low)
+    low, high = ([*map(float, bounds)] for bounds in (task.action_low, task.action_high))
+
+    def vector(name: str, dtype: Any, size: int, attributes: dict[str, Any]) -> ArraySpec:
+        return ArraySpec(name=name, dtype=dtype, shape=(size,), dims=(f"{name}_dim",), attributes=attributes)
+
     return (
-        ArraySpec(
-            name="state", dtype="float32", shape=(task.state_size,), dims=("state_dim",), attributes={"fields": fields}
-        ),
-        ArraySpec(name="action", dtype="float32", shape=(action,), dims=("action_dim",), attributes=bounds),
+        vector("state", "float32", task.state_size, {"fields": fields}),
+        vector("action", "float32", len(low), {"low": low, "high": high}),
         ArraySpec(name="reward", dtype="float32"),
         ArraySpec(name="discount", dtype="float32"),
-        ArraySpec(
-            name="physics", dtype="float64", shape=(task.physics_size,), dims=("physics_dim",), attributes=physics
-        ),
+        vector("physics", "float64", task.physics_size, dict(task.array_attributes.get("physics", {}))),
         ArraySpec(name="length", dtype="int32", steps=False),
         ArraySpec(name="terminated", dtype="bool", steps=False),
         ArraySpec(name="return", dtype="float64", steps=False),

@@ -30,7 +30,7 @@ from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.options import Local, Location, checked
 from dmcvb_gen.policies.header import OWN_CODE, origin_of
 from dmcvb_gen.release.croissant import HOME, Publication, croissant, derived_from, generator, groups, page_of
-from dmcvb_gen.release.episode_table import TABLE, header_facts, table_rows, write_table
+from dmcvb_gen.release.episode_table import CONFIG, TABLE, table_rows, write_table
 from dmcvb_gen.release.templates import fill
 from dmcvb_gen.spec import ALL_PARTS, CUE, DISTRACTOR_KINDS, DistractorSetting
 from dmcvb_gen.storage.places import local_path
@@ -66,20 +66,15 @@ def write_card(release: Location, out: Local | None = None, url: str | None = No
     """
     opened = _open(release)
     folder = local_path(out) if out else opened.path
-    _refuse_another_readme(folder)
+    readme = folder / README
+    if readme.is_file() and "dmcvb-gen" not in readme.read_text(errors="replace"):
+        raise StoreError(f"{readme} is not a card, and it would be replaced; give another --out")
     store = open_store(folder)
     with tempfile.TemporaryDirectory() as scratch:  # so that a failure leaves no half of a card
         names = _write_files(opened, Path(scratch), folder, _published(folder, opened.manifest, url))
         for name in names:
             store.replace(name, (Path(scratch) / name).read_bytes())
     return [folder / name for name in names]
-
-
-def _refuse_another_readme(folder: Path) -> None:
-    """Refuse a folder whose README.md is not a card."""
-    readme = folder / README
-    if readme.is_file() and "dmcvb-gen" not in readme.read_text(errors="replace"):
-        raise StoreError(f"{readme} is not a card, and it would be replaced; give another --out")
 
 
 def _write_files(
@@ -97,7 +92,12 @@ def _write_files(
     write_table(release, made / TABLE)
     if keep_table and table_rows(folder / TABLE) == table_rows(made / TABLE):
         shutil.copyfile(folder / TABLE, made / TABLE)
-    texts = _texts(release, made / TABLE, published)
+    facts, limits = describe_release(release.path), _limits(release)
+    summary = _summary(release, facts)
+    texts = {
+        README: card_text(release, facts, summary, limits),
+        CROISSANT: croissant(release, facts, summary, CITATION, limits, made / TABLE, published),
+    }
     for name, text in texts.items():
         (made / name).write_text(text)
     Image.fromarray(_sheet(release)).save(made / SHEET, "PNG")
@@ -132,16 +132,11 @@ def check_card(root: str | Path) -> list[str]:
         if release.copy:
             fits = table_rows(made / TABLE) <= table_rows(folder / TABLE)
             return [] if fits else [f"{TABLE} does not match the local episodes"]
-        return [
-            f"{name} {'does not match the release' if (folder / name).is_file() else 'is missing'}"
-            for name in names
-            if not _same(folder / name, made / name)
-        ]
-
-
-def _same(path: Path, made: Path) -> bool:
-    """Return True if a card has this file as it is made now. Pictures need only exist: libraries draw differently."""
-    return path.is_file() and (path.suffix == ".png" or path.read_bytes() == made.read_bytes())
+        findings = [f"{name} is missing" for name in names if not (folder / name).is_file()]
+        # Pictures need only exist: libraries draw differently.
+        others = [name for name in names if not name.endswith(".png") and (folder / name).is_file()]
+        differ = [name for name in others if (folder / name).read_bytes() != (made / name).read_bytes()]
+        return findings + [f"{name} does not match the release" for name in differ]
 
 
 def _open(root) -> Release:
@@ -149,15 +144,6 @@ def _open(root) -> Release:
     if not release.subsets:
         raise StoreError(f"{root} has no episodes yet; run the rollout first")
     return release
-
-
-def _texts(release: Release, table: Path, published: Publication) -> dict[str, str]:
-    facts = describe_release(release.path)
-    summary = _summary(release, facts)
-    limits = _limits(release)
-    metadata = croissant(release, facts, summary, CITATION, limits, table, published)
-    text = card_text(release, facts, summary, limits, header_facts(table))
-    return {README: text, CROISSANT: metadata}
 
 
 def _sheet(release: Release) -> np.ndarray:
@@ -186,12 +172,8 @@ def _summary(release: Release, facts: dict[str, Any]) -> str:
     return text.strip()
 
 
-def header(manifest: Manifest | Resolved, steps: int, table: dict[str, Any]) -> str:
-    """The YAML header that the Hugging Face Hub reads.
-
-    Args:
-      table: facts about the table of episodes, see `episode_table.header_facts`.
-    """
+def header(manifest: Manifest | Resolved, steps: int) -> str:
+    """The YAML header that the Hugging Face Hub reads."""
     category = next((name for limit, name in SIZES if steps < limit), "n>10M")
     facts = {
         "pretty_name": f"{manifest.name} {manifest.version}",
@@ -199,13 +181,12 @@ def header(manifest: Manifest | Resolved, steps: int, table: dict[str, Any]) -> 
         "task_categories": ["reinforcement-learning", "robotics"],
         "tags": ["offline-rl", "visual-distractors", "mujoco", "dm-control", "zarr", "croissant", "synthetic"],
         "size_categories": [category],
+        "configs": [CONFIG],
     }
-    return f"---\n{yaml.safe_dump(facts | table, sort_keys=False, allow_unicode=True)}---"
+    return f"---\n{yaml.safe_dump(facts, sort_keys=False, allow_unicode=True)}---"
 
 
-def card_text(
-    release: Release, facts: dict[str, Any], summary: str, limits: Sequence[str], table: dict[str, Any]
-) -> str:
+def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Sequence[str]) -> str:
     """The text of README.md, from the template data/card.md.jinja."""
     manifest = release.manifest
     text = fill(
@@ -216,7 +197,7 @@ def card_text(
         facts=facts,
         summary=summary,
         limits=limits,
-        header=header(manifest, facts["steps"], table),
+        header=header(manifest, facts["steps"]),
         arrays=_arrays(release),
         statistics=STATISTICS,
         successes={s.name: float(s.read("terminated").mean()) for s in release.subsets.values() if s.record.goal_mode},
@@ -319,17 +300,10 @@ def _limits(release: Release) -> list[str]:
     if algorithms := {str(policy.header.get("algorithm", "unknown means")) for policy in policies} - {OWN_CODE}:
         how = " and ".join(origin_of(name) for name in sorted(algorithms))
         limits.append(f"Behaviour policies were trained {how}; the paper's by MPO.")
-    steps = {name: subset.steps for name, subset in release.subsets.items()}
-    small = [name for name, count in steps.items() if count < 1_000_000]
-    if small:
-        which = "All" if len(small) == len(steps) else f"{len(small)} of {len(steps)}"
-        limits.append(f"{which} subsets have fewer steps than the paper's million.")
     repeats = sorted({record.action_repeat for record in manifest.subsets})
     if repeats != [ACTION_REPEAT]:
         held = " or ".join(map(str, repeats))
         limits.append(f"An action is held for {held} control steps, in DMC-VB for {ACTION_REPEAT}.")
-    seconds = {record.seconds_per_step for record in manifest.subsets}
-    limits.append(f"Simulated data alone, at {', '.join(f'{1 / s:.0f}' for s in sorted(seconds))} steps a second.")
     if release.manifest.imported:
         limits.append("Imported data have no physics states and no labels, so nothing can be rendered from them.")
     else:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import Layer, SubsetRecord
+from dmcvb_gen.dataset.manifest import Layer, SubsetRecord, shortened
 from dmcvb_gen.storage.places import is_url
-from dmcvb_gen.text import pluralize
-
-SHOWN = 5
-"""Shards named of an array before the rest is counted."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +41,7 @@ def _releases(a: Release, b: Release) -> Iterator[Difference]:
     for field in ("name", "version", "license", "authors"):
         one, other = getattr(a.manifest, field), getattr(b.manifest, field)
         if one != other:
-            yield Difference("", f"{field}: {_short(one)} and {_short(other)}")
+            yield Difference("", f"{field}: {shortened(one)} and {shortened(other)}")
     if a.digest != b.digest:
         yield Difference("", f"digest: {a.digest} and {b.digest}")
 
@@ -59,7 +55,7 @@ def _subsets(a: Release, b: Release) -> Iterator[Difference]:
         for field in SubsetRecord.model_fields:
             one, other = getattr(mine[name], field), getattr(theirs[name], field)
             if field != "layers" and one != other:
-                yield Difference(name, f"{field}: {_short(one)} and {_short(other)}")
+                yield Difference(name, f"{field}: {shortened(one)} and {shortened(other)}")
         here = [len(release.subsets[name]) if name in release.subsets else 0 for release in (a, b)]
         if here[0] != here[1]:
             yield Difference(name, f"local episodes: {here[0]} and {here[1]}")
@@ -84,21 +80,11 @@ def _shards(a: Release, b: Release, one: Layer, other: Layer) -> Iterator[Differ
     if one.episodes_per_shard != other.episodes_per_shard or not (a.here(one.name) and b.here(one.name)):
         return
     mine, theirs = a.records(one.name), b.records(one.name)
-    arrays: dict[str, list[tuple[int, int]]] = {}
+    arrays: dict[str, list[str]] = {}
     for number in sorted(mine.keys() & theirs.keys()):
         files, span = (mine[number].files, theirs[number].files), one.episodes_of(number)
         for array in sorted({*files[0], *files[1]}):
             if files[0].get(array) != files[1].get(array):
-                arrays.setdefault(array, []).append((span.start, span.stop))
+                arrays.setdefault(array, []).append(f"{span.start}:{span.stop}")
     for array, spans in arrays.items():
-        yield Difference(one.name, f"{array} has other bytes in the episodes {_spans(spans)}")
-
-
-def _spans(spans: Sequence[tuple[int, int]]) -> str:
-    named = ", ".join(f"{first}:{last}" for first, last in spans[:SHOWN])
-    return named + (f" and {pluralize(len(spans) - SHOWN, 'shards')} more" if len(spans) > SHOWN else "")
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    return text if len(text) < 60 else text[:57] + "..."
+        yield Difference(one.name, f"{array} has other bytes in the episodes {shortened(', '.join(spans))}")

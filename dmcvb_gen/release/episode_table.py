@@ -1,7 +1,7 @@
 """Write a Parquet table with one row for each episode of a release.
 
 The viewer of the Hugging Face Hub shows it, and `datasets.load_dataset` reads it. The schema and the card's header
-(`header_facts`) say that the first frames are pictures.
+(`CONFIG`) say that the first frames are pictures.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
 
 TABLE = f"{CARD_FOLDER}episodes.parquet"
-CONFIG = "episodes"
+CONFIG = {"config_name": "episodes", "default": True, "data_files": [{"split": "train", "path": TABLE}]}
+"""Where the Hub finds the table, for the card's header."""
 FRAME = 64
 """Largest width and height of a first frame in pixels."""
 ROWS = 500
@@ -64,24 +65,6 @@ def table_rows(path: Path) -> set[tuple]:
     except (pa.ArrowInvalid, OSError, KeyError):
         return set()
     return {tuple(row.values()) for row in table.to_pylist()}
-
-
-def header_facts(path: Path) -> dict[str, Any]:
-    """`configs` and `dataset_info` of the card's header, for the table at `path`."""
-    data = pq.read_metadata(path)
-    size = sum(data.row_group(group).total_byte_size for group in range(data.num_row_groups))
-    return {
-        "configs": [
-            {"config_name": CONFIG, "default": True, "data_files": [{"split": "train", "path": TABLE}]},
-        ],
-        "dataset_info": {
-            "config_name": CONFIG,
-            "features": [{"name": name, "dtype": _dtype(kind)} for name, (kind, _) in COLUMNS.items()],
-            "splits": [{"name": "train", "num_bytes": size, "num_examples": data.num_rows}],
-            "download_size": path.stat().st_size,
-            "dataset_size": size,
-        },
-    }
 
 
 def _dtype(kind: pa.DataType) -> str:

@@ -197,31 +197,18 @@ def _record(
     name: str, facts: tuple[str, str, str], folders: tuple[Path, ...], places: tuple[Place, ...]
 ) -> SubsetRecord:
     task, level, setting = facts
-    hidden = SubsetSpec.parse(task, level, setting).hides_goal
-    features = _step_features(folders[0])
-    pictures = {
-        view: features.get(f"observation/{picture_feature(task, view, hidden)}", {}).get("image")
-        for view in get_task(task).views
-    }
-    views = tuple(view for view, picture in pictures.items() if picture)
+    hidden, of = SubsetSpec.parse(task, level, setting).hides_goal, get_task(task)
+    images, sizes = {view: picture_feature(task, view, hidden) for view in of.views}, _image_sizes(folders[0])
+    views = tuple(view for view, image in images.items() if image in sizes)
     if not views:
-        wanted = picture_feature(task, get_task(task).views[0], hidden)
+        wanted = images[of.views[0]]
         raise StoreError(f"{folders[0]}/features.json has no image observation/{wanted}; it is no {name} of DMC-VB")
     for number, path in enumerate(folders):
         if not any(place.folder == number for place in places):
             raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
-    of = get_task(task)
     pairs = [_goal_pair(place, place.read(), len(folders)) for place in places] if setting == FIXED else []
     goals = max(pairs, default=0) + 1
     in_order = pairs == [pair for pair in range(goals) for _ in range(len(pairs) // goals)]
-    try:
-        size = int(pictures[views[0]]["shape"]["dimensions"][0])
-        if not 0 < size <= MAX_SIZE:
-            raise ValueError(f"{size} pixels")
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise StoreError(
-            f"the features.json of {name} does not say a size of images ({error}); fetch the folder again"
-        ) from None
     return SubsetRecord(
         name=name,
         task=task,
@@ -229,7 +216,7 @@ def _record(
         setting=setting,
         episodes=len(places),
         layers=("none-yet",),
-        size=size,
+        size=sizes[images[views[0]]],
         renderer={"name": IMPORTED},
         family=of.family,
         views=views,
@@ -266,22 +253,24 @@ def _goal_pair(place: Place, values: dict[str, Any], folders: int) -> int:
     return pair
 
 
-def _step_features(path: Path) -> dict[str, Any]:
-    """Flat names of a step's features -> their JSON."""
+def _image_sizes(path: Path) -> dict[str, int]:
+    """A step's observations that are images -> their pixels a side."""
     try:
         tree = parse_json((path / "features.json").read_bytes())
-        steps = tree["featuresDict"]["features"]["steps"]["sequence"]["feature"]
-        return dict(_flatten(steps))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        steps = dict(_flatten(tree["featuresDict"]["features"]["steps"]["sequence"]["feature"]))
+        images = {name: feature["image"] for name, feature in steps.items() if feature.get("image")}
+        sizes = {name: int(image["shape"]["dimensions"][0]) for name, image in images.items()}
+        if not all(0 < size <= MAX_SIZE for size in sizes.values()):
+            raise ValueError
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise StoreError(f"{path}/features.json does not describe RLDS steps ({type(error).__name__})") from None
+    return {name.removeprefix("observation/"): size for name, size in sizes.items()}
 
 
 def _flatten(feature: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
     if "featuresDict" in feature:
         for name, inner in feature["featuresDict"]["features"].items():
             yield from _flatten(inner, f"{prefix}/{name}" if prefix else name)
-    elif not isinstance(feature, dict):
-        raise ValueError(f"{prefix} is no feature")
     else:
         yield prefix, feature
 
@@ -327,14 +316,8 @@ def _import_subset(source: _Source, layers: list[Layer], store: Store, progress:
 
 
 def _import_episode(source: _Source, place: Place, arrays: dict[str, np.ndarray]) -> None:
-    values, fixed = place.read(), source.record.setting == FIXED
-    _fill(arrays, values, source.record, place.file)
-    arrays["behaviour"][0] = -1
-    arrays["goal_pair"][0] = _goal_pair(place, values, len(source.folders)) if fixed else -1
-
-
-def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], record: SubsetRecord, file: Path) -> None:
-    """Put one decoded episode into rows of a shard's arrays."""
+    """Put one episode into rows of a shard's arrays."""
+    values, record = place.read(), source.record
     task = get_task(record.task)
     try:
         count = len(values["steps/reward"])
@@ -351,9 +334,11 @@ def _fill(arrays: dict[str, np.ndarray], values: dict[str, Any], record: SubsetR
         arrays["discount"][0, :length] = 1
         arrays["discount"][0, length - 1] = 0 if terminated else 1
     except (KeyError, ValueError, TypeError, OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise StoreError(f"an episode of {file} is not one of {task.id}: {error}; fetch the file again") from None
+        raise StoreError(f"an episode of {place.file} is not one of {task.id}: {error}; fetch the file again") from None
     arrays["length"][0], arrays["terminated"][0] = length, terminated
-    arrays["return"][0] = arrays["reward"][0].astype(np.float64).sum()
+    arrays["return"][0], arrays["behaviour"][0] = arrays["reward"][0].astype(np.float64).sum(), -1
+    fixed = record.setting == FIXED
+    arrays["goal_pair"][0] = _goal_pair(place, values, len(source.folders)) if fixed else -1
 
 
 def _picture(data: bytes, size: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection
 
 from dmcvb_gen.dataset.gate import Release
@@ -21,6 +22,7 @@ from dmcvb_gen.dataset.manifest import (
     ListedLayer,
     Manifest,
     canonical_json,
+    file_of,
     is_attachment,
     list_path,
 )
@@ -42,7 +44,7 @@ def described_files(release: Release, names: Collection[str]) -> tuple[FileRecor
     Raises:
       StoreError: a recipe is missing or was altered.
     """
-    recipes = [FileRecord.of(f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe)) for recipe in release.recipes]
+    recipes = [file_of(f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe)) for recipe in release.recipes]
     return (*release.inputs_of(names), *recipes)
 
 
@@ -53,7 +55,7 @@ def list_files(release: Release, layers: Collection[str]) -> tuple[FileRecord, .
         if isinstance(layer := release.layers[name], ListedLayer):
             records = release.records(name)
             text = canonical_json(LayerList(shards=tuple(records[number] for number in sorted(records))))
-            found[layer.list] = FileRecord.of(list_path(layer.list), text)
+            found[layer.list] = file_of(list_path(layer.list), text)
     return tuple(found.values())
 
 
@@ -77,10 +79,8 @@ def attachments(store: Store) -> dict[str, bytes]:
     except StoreError:  # a web server gives no lists
         notes = []
     for path in (*ATTACHMENTS, *notes):
-        try:
+        with contextlib.suppress(NotThere):
             found[path] = store.read(path, ATTACHMENT_BYTES)
-        except NotThere:
-            continue
     return found
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, FileRecord, is_attachment
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, FileRecord, file_of, is_attachment
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.writer import plain_metadata, wrong_bytes
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
@@ -197,7 +197,7 @@ def _expected(release: Release) -> tuple[list[Listed], list[Issue]]:
     except StoreError as error:
         findings.append(Issue("files", RECIPES, str(error)))
     if not release.in_the_making and not findings:
-        plain = (FileRecord.of(path, text) for path, text in plain_metadata(release).items())
+        plain = (file_of(path, text) for path, text in plain_metadata(release).items())
         files += [(file.path, file) for file in (*list_files(release, used), *plain)]
     return files, findings
 

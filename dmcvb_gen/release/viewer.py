@@ -128,17 +128,13 @@ def _with_pictures(release: ReleaseReader, size: int | None) -> ReleaseReader:
 
 def _fitted(release: Release, parts: list[dict[str, Any]], max_bytes: int) -> tuple[bytes, int]:
     """The page with as many pictures as fit, and every how many-th picture that is."""
-    stride = 1
-    while True:
-        page = _page(release, [_with_sheets(part, stride) for part in parts])
-        longest = max(part["length"] for part in parts)
-        if len(page) <= max_bytes or stride > longest:
-            break
+    stride, longest = 1, max(part["length"] for part in parts)
+    while len(page := _page(release, [_with_sheets(part, stride) for part in parts])) > max_bytes:
+        if stride > longest:
+            raise StoreError(
+                f"{len(parts)} episodes do not fit into {max_bytes / 1e6:.1f} MB; take fewer with --only or --episodes"
+            )
         stride = max(stride + 1, math.ceil(stride * len(page) / max_bytes))
-    if len(page) > max_bytes:
-        raise StoreError(
-            f"{len(parts)} episodes do not fit into {max_bytes / 1e6:.1f} MB; take fewer with --only or --episodes"
-        )
     return page, stride
 
 

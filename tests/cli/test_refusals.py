@@ -164,7 +164,6 @@ PYTHON = [
     (lambda out: dmcvb_gen.paint(out, views=[]), "views names no view"),
     (lambda out: dmcvb_gen.regenerate(manifest="quickstart"), "out=FOLDER"),
     (lambda out: dmcvb_gen.verify(out, everything=True), "always read whole"),
-    (lambda out: dmcvb_gen.fetch("file:/nowhere", out, size=32), "paint=True"),
     (lambda out: dmcvb_gen.fetch("file:publ", out, episode_range=(2, 2)), "with 0 <= A < B"),
     (lambda out: dmcvb_gen.export(out, "hdf5", out / "x"), "no release"),
     (lambda out: dmcvb_gen.validate(out, checks_only=True, agents="bc"), ": checks_only trains nothing"),

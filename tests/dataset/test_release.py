@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import ShardRecord, build_manifest, canonical_json, record_path, shard_size
+from dmcvb_gen.dataset.manifest import ShardRecord, canonical_json, record_path, shard_size
 from dmcvb_gen.dataset.writer import (
     begin,
     check_versions,
@@ -116,12 +116,6 @@ def test_growths_in_any_order_give_one_manifest_and_asking_for_less_changes_none
     for index in order:
         release = made_up.make(store, GROWTHS[index])
     assert release.digest == largest.digest and len(release.manifest.recipes) == 1
-
-
-def test_part_of_the_shards_makes_no_subset_whole(store):
-    wanted = made_up.recipe(4, ["none"])
-    lists = {layer.name: (ShardRecord(key=layer.job_key(0), files={}),) for layer in wanted.layers}
-    assert build_manifest([wanted], lists) is None
 
 
 REFUSED = {

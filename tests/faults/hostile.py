@@ -127,23 +127,11 @@ def valid_release() -> Files:
         return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-RECIPE = """
-name: small
-version: 1.0.0
-seed: 3
-size: 16
-subsets:
-  - tasks: [walker-walk, cheetah-run]
-    levels: [random]
-    settings: [none, static, dynamic]
-    episodes: 3
-    episodes_per_shard: 2
-  - tasks: ant-maze-empty7x7
-    levels: [random]
-    settings: [fixed]
-    fixed_goals: 2
-    episodes_per_goal: 2
-"""
+WALKERS = {"tasks": ["walker-walk", "cheetah-run"], "levels": ["random"], "settings": ["none", "static", "dynamic"]}
+MAZES = {"tasks": "ant-maze-empty7x7", "levels": ["random"], "settings": ["fixed"]}
+MAZES |= {"fixed_goals": 2, "episodes_per_goal": 2}
+RECIPE = {"name": "small", "version": "1.0.0", "seed": 3, "size": 16}
+RECIPE |= {"subsets": [WALKERS | {"episodes": 3, "episodes_per_shard": 2}, MAZES]}
 _NINE = b"%c: &%c [*%c,*%c,*%c,*%c,*%c,*%c,*%c,*%c,*%c]\n"
 YAML_BOMBS = [
     b"a: &a [x,x,x,x,x,x,x,x,x]\n" + b"".join(_NINE % (c + 1, c + 1, *[c] * 9) for c in range(97, 107)),
@@ -244,21 +232,17 @@ def valid_pictures() -> Files:
     import numpy as np
     from PIL import Image
 
-    frames = [Image.fromarray(np.full((16, 16, 3), 60 * i, np.uint8)) for i in range(4)]
-    out: Files = {}
-    for suffix in ("png", "jpg", "bmp", "gif", "webp"):
+    frames, out = [Image.fromarray(np.full((16, 16, 3), 60 * i, np.uint8)) for i in range(4)], {}
+    for kind in ("png", "bmp", "gif", "webp"):
         data = io.BytesIO()
-        kind = {"jpg": "JPEG"}.get(suffix, suffix.upper())
-        more = {"save_all": True, "append_images": frames[1:]} if suffix in ("gif", "webp") else {}
+        more = {"save_all": True, "append_images": frames[1:]} if kind in ("gif", "webp") else {}
         frames[0].save(data, kind, **more)
-        out[f"a.{suffix}"] = data.getvalue()
-    video = "-v error -f lavfi -i testsrc=size=32x32:rate=5:duration=1".split()
+        out[f"a.{kind}"] = data.getvalue()
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *"-v error -f lavfi -i testsrc=size=32x32:rate=5:duration=1".split()]
     with tempfile.TemporaryDirectory() as folder:
-        for suffix in ("mp4", "avi", "mkv"):
-            subprocess.run(
-                [imageio_ffmpeg.get_ffmpeg_exe(), *video, f"{folder}/a.{suffix}"], check=True, stdin=subprocess.DEVNULL
-            )
-            out[f"a.{suffix}"] = Path(f"{folder}/a.{suffix}").read_bytes()
+        for kind in ("mp4", "mkv"):
+            subprocess.run([*command, f"{folder}/a.{kind}"], check=True, stdin=subprocess.DEVNULL)
+            out[f"a.{kind}"] = Path(f"{folder}/a.{kind}").read_bytes()
     return out
 
 
@@ -395,10 +379,7 @@ def _with(prefix: str, files: st.SearchStrategy[Files]) -> st.SearchStrategy[Fil
 
 
 def _recipes() -> st.SearchStrategy[Files]:
-    import yaml
-
-    tree = changed_tree(yaml.safe_load(RECIPE)).map(lambda value: json.dumps(value).encode())
-    text = st.one_of(tree, tree, tree, changed_bytes(RECIPE.encode()), st.sampled_from(YAML_BOMBS))
+    text = st.one_of(changed_json(json.dumps(RECIPE).encode()), st.sampled_from(YAML_BOMBS))
     return text.map(lambda data: {"recipe.yaml": data})
 
 
@@ -409,7 +390,7 @@ KINDS: dict[str, Kind] = {
     "resolved": Kind(_one_of_release(lambda name: name.startswith("recipes/")), take_release, _unfinished),
     "chunk": Kind(_one_of_release(lambda name: "/c/" in name), take_release, valid_release),
     "published": Kind(_one_of_release(lambda name: name.endswith(".json"), "there/"), take_published, _published),
-    "recipe": Kind(_recipes, take_recipe, lambda: {"recipe.yaml": RECIPE.encode()}),
+    "recipe": Kind(_recipes, take_recipe, lambda: {"recipe.yaml": json.dumps(RECIPE).encode()}),
     "policy": Kind(
         lambda: changed_policy().map(lambda data: {"p.safetensors": data}),
         take_policy,

@@ -95,8 +95,6 @@ def test_the_hubs_loader_reads_the_episodes_with_their_first_frames(small_releas
         rows = datasets.load_dataset(str(folder), cache_dir=str(tmp_path / "cache"))["train"]
         release = Release.open(source)
         assert fields["configs"][0]["data_files"] == [{"split": "train", "path": "card/episodes.parquet"}]
-        assert fields["dataset_info"]["splits"][0]["num_examples"] == len(rows)
-        assert {f["name"]: f["dtype"] for f in fields["dataset_info"]["features"]}["first_frame"] == "image"
         for row in rows:
             subset, episode = release[row["subset"]], row["episode"]
             name = training_pictures(subset).arrays[0]

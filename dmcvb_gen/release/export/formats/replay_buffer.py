@@ -46,5 +46,4 @@ def write(source: Source, folder: Path) -> None:
             stored.resize((before + length, *value.shape[1:]))
             stored[before:] = value
         ends.append(before + length)
-    where = meta.create_array("episode_ends", shape=(len(ends),), chunks=(max(len(ends), 1),), dtype="int64")
-    where[:] = np.array(ends)
+    meta.create_array("episode_ends", data=np.array(ends, np.int64))
