@@ -57,6 +57,12 @@ def _sample(count: int, wanted: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
 
 
+def _sampled(subset: Subset, places: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Some episodes and their lengths, out of those at some places among those that are here."""
+    for place in places[_sample(len(places), SAMPLE_EPISODES)]:
+        yield int(subset.episodes[place]), int(subset.lengths[place])
+
+
 def check_values(subset: Subset) -> Iterator[Issue]:
     """Shapes, lengths, finite values, actions in range, returns, duplicated episodes."""
     task = get_task(subset.task).at(subset.record.action_repeat)
@@ -108,8 +114,7 @@ def check_physics(subset: Subset) -> Iterator[Issue]:
     known = np.ones(task.state_size, bool)
     for name in task.unstored_fields:
         known[task.state_slices[name]] = False
-    for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
-        episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+    for episode, length in _sampled(subset, np.arange(len(subset.episodes))):
         values = subset.episode(episode, ["state", "action", "reward", "physics"])
         steps = _sample(length, SAMPLE_STEPS)
         batch = task.batch(len(steps))
@@ -136,8 +141,7 @@ def check_replays(subset: Subset) -> Iterator[Issue]:
     that comes at once is a finding.
     """
     task, makes = get_task(subset.task).at(subset.record.action_repeat), subset.trajectories.makes
-    for index in _sample(len(subset.episodes), SAMPLE_EPISODES):
-        episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+    for episode, length in _sampled(subset, np.arange(len(subset.episodes))):
         values = subset.episode(episode, ["state", "action", "reward", "physics"])
         made = replay(task, values["action"][:length], episode, makes["seed"], tuple(makes["streams"]))
         if made.length[0] != length:
@@ -173,8 +177,7 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Iss
     renderer, _ = renderer_for(subset.record, source, split)
     try:
         painted_here = np.flatnonzero(~subset.unpainted[subset.episodes])
-        for index in painted_here[_sample(len(painted_here), SAMPLE_EPISODES)]:
-            episode, length = int(subset.episodes[index]), int(subset.lengths[index])
+        for episode, length in _sampled(subset, painted_here):
             values = subset.episode(episode, ["physics", *subset.pixel_arrays, *stored_in(subset.arrays)])
             steps = _sample(length + 1, SAMPLE_FRAMES)
             labels = subset.labels([episode])[0][: length + 1]

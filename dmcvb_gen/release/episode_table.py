@@ -18,7 +18,7 @@ from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import CARD_FOLDER
-from dmcvb_gen.dataset.pictures import Pictures, shown, training_pictures
+from dmcvb_gen.dataset.pictures import shown, training_pictures
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
@@ -100,7 +100,8 @@ def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
 
 def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     """The column of the pictures: the stored ones, others rendered from physics states and labels."""
-    pictures = _pictures(subset)
+    pictures = training_pictures(subset)
+    pictures = pictures if pictures.views else shown(subset)  # the overhead view, if there is no other
     name, frames = pictures.arrays[0], dict.fromkeys(episodes.tolist())
     lacking = episodes[subset.unpainted[episodes]] if name in subset.arrays else episodes
     for episode in np.setdiff1d(episodes, lacking).tolist():
@@ -114,12 +115,6 @@ def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
             renderer.close()
         frames |= dict(zip(lacking.tolist(), made, strict=True))
     return {"first_frame": [_picture(frame) for frame in frames.values()]}
-
-
-def _pictures(subset: Subset) -> Pictures:
-    """The views that agents learn from; the overhead view if there is no other."""
-    pictures = training_pictures(subset)
-    return pictures if pictures.views else shown(subset)
 
 
 def _picture(frame: np.ndarray | None) -> dict[str, Any] | None:

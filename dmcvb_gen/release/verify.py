@@ -247,13 +247,13 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
         from dmcvb_gen.distractors.registry import distractors_of
         from dmcvb_gen.release import contents
         from dmcvb_gen.tasks import get_task
+
+        get_task(subset.task)
+        distractors_of(subset.record.distractor)
     except ModuleNotFoundError as error:
         # Fetch-only installs have no simulator; bytes are checked all the same, and this says what was not.
         log.warning("values, physics and images of %s were not checked: %s is not installed", subset.name, error.name)
         return []
-    try:
-        get_task(subset.task)
-        distractors_of(subset.record.distractor)
     except DmcvbError as error:  # a user's own code, which cannot be imported or does not run on this machine
         return [Issue(UNCHECKED, subset.name, f"values, physics and images cannot be checked here: {error}")]
     try:

@@ -26,7 +26,7 @@ from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
-from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
+from dmcvb_gen.loaders.release import SubsetReader, open_for_reading
 from dmcvb_gen.options import Count, Local, Location, Names, checked, progress_bar
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import is_url, local_path
@@ -101,7 +101,8 @@ def view(
     imported = [name for name in names if release[name].record.imported]
     if size and imported:
         raise StoreError(f"{imported[0]} was imported and has no physics states to paint from; remove --size")
-    release = _with_pictures(release, size)
+    if size or any(subset.unpainted.any() for subset in release.subsets.values()):
+        release = painted_release(release, Painting(size=size), missing=not size)
     each = episodes or max(1, EPISODES // len(names))
     chosen = [(release[name], int(index)) for name in names for index in release[name].episodes[:each]]
     parts = []
@@ -118,12 +119,6 @@ def view(
         with storage_errors(target, "write to"):
             write_bytes(target, page)
     return Written(target, len(page), len(parts), len(names), stride)
-
-
-def _with_pictures(release: ReleaseReader, size: int | None) -> ReleaseReader:
-    """The release with all pictures readable: stored, or painted on reading."""
-    whole = not any(subset.unpainted.any() for subset in release.subsets.values())
-    return release if whole and not size else painted_release(release, Painting(size=size), missing=not size)
 
 
 def _fitted(release: Release, parts: list[dict[str, Any]], max_bytes: int) -> tuple[bytes, int]:
@@ -170,6 +165,8 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
     labels = [name for name in DISTRACTOR_STATE_NAMES if shows and f"exogenous/{name}" in subset.arrays]
     numbers = ["state", "action", "reward", "seed", "terminated"]
     values = subset.episode(index, [*numbers, *(f"exogenous/{name}" for name in labels), *pictures.arrays])
+    actuators = [name or f"action {n}" for n, name in enumerate(subset.record.actuators)]
+    actuators = actuators or [f"action {n}" for n in range(values["action"].shape[1])]
     return {
         "subset": subset.name,
         "index": index,
@@ -184,7 +181,7 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
         "frames": {view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
         "curves": {
             "reward": [_curve("reward", values["reward"]), _curve("return so far", np.cumsum(values["reward"]))],
-            "action": [_curve(name, column) for name, column in _action_columns(subset, values["action"])],
+            "action": [_curve(name, column) for name, column in zip(actuators, values["action"].T, strict=True)],
             "state": [_curve(name, column) for name, column in _state_columns(subset, values["state"])],
             "distractor": [
                 _curve(name, column)
@@ -193,12 +190,6 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
             ],
         },
     }
-
-
-def _action_columns(subset: SubsetReader, action: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    names = subset.record.actuators or [""] * action.shape[1]
-    for number, (name, column) in enumerate(zip(names, action.T, strict=True)):
-        yield name or f"action {number}", column
 
 
 def _state_columns(subset: SubsetReader, state: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

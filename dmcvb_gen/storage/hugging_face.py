@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.storage.interface import ANY, Store
 from dmcvb_gen.storage.places import Place
@@ -45,14 +45,11 @@ class HubStore(Store):
         """The store of an hf: place.
 
         Raises:
-          StoreError: it names no data set repository. UnknownNameError: an option that it does not take.
+          StoreError: it names no data set repository.
         """
         found = _PATH.fullmatch(place.path)
         if not found:
             raise StoreError(f"{place} is not hf://datasets/OWNER/NAME (or a folder in it, or @REVISION)")
-        for name in options:
-            if name not in ("token", "endpoint"):
-                raise UnknownNameError("option of the Hub", name, ["token", "endpoint"])
         folder = (found["folder"] or "").strip("/")
         return cls(found["name"], folder and f"{folder}/", found["revision"], **options)
 

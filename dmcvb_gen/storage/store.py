@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.storage.interface import ANY, NotThere, Store
 from dmcvb_gen.storage.places import WEB, Place
+
+TAKEN = {"hf": ("endpoint", "token"), **dict.fromkeys(WEB, ("headers",))}
+"""Options that places take, but for buckets, whose file systems know theirs."""
 
 __all__ = ["ANY", "NotThere", "Store", "open_store"]
 
@@ -32,6 +35,9 @@ def open_store(place: str | Path, options: Mapping[str, Any] | None = None) -> S
         if options:
             raise StoreError(f"--option has no effect: {parsed} is a folder, not a URL; remove it")
         return LocalStore(Path(parsed.path))
+    for name in options or ():
+        if name not in TAKEN.get(parsed.protocol, [name]):
+            raise UnknownNameError(f"option of {parsed.protocol}", name, TAKEN[parsed.protocol])
     if parsed.protocol == "hf":
         from dmcvb_gen.storage.hugging_face import HubStore
 

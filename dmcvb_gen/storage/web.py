@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import quote
 
-from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.interface import PIECE, Store
 from dmcvb_gen.storage.places import Place
 
@@ -40,9 +40,6 @@ class HttpStore(Store):
 
     @classmethod
     def at(cls, place: Place, options: Mapping[str, Any]) -> HttpStore:
-        for name in options:
-            if name != "headers":
-                raise UnknownNameError("option of web servers", name, ["headers"])
         return cls(str(place), place.login, place.query, dict(options.get("headers", {})))
 
     @property

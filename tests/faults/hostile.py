@@ -1,4 +1,4 @@
-"""Hostile files, made from valid ones by hypothesis, and what takes them, in a child with a bound on memory and time.
+"""Hostile files, made from valid ones by hypothesis, and what takes them, with a bound on memory and time.
 
 A case is a few files of a folder that is otherwise sound. Whoever takes it may refuse it with a DmcvbError or accept
 it; it may not raise anything else, run a program, write outside the case's folder, take a gigabyte or ten seconds.
@@ -11,7 +11,6 @@ import copy
 import functools
 import io
 import json
-import multiprocessing
 import os
 import resource
 import shutil
@@ -20,10 +19,9 @@ import struct
 import subprocess
 import sys
 import tempfile
-import time
 import traceback
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -405,41 +403,11 @@ KINDS: dict[str, Kind] = {
 }
 
 
-# -- the child that takes them -----------------------------------------------------------------------------------
-
-
-class Taker:
-    """A child that takes cases, one after the other, under a bound on its memory; another follows if it dies."""
-
-    def __enter__(self) -> Taker:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=[theirs])
-        self._process.start()
-        theirs.close()
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._pipe.close()
-        self._process.join(60)
-
-    def take(self, kind: str, files: Files) -> str | None:
-        """What went wrong with a case of a kind; None if it was refused or accepted as it must be."""
-        self._pipe.send((kind, files))
-        try:
-            return self._pipe.recv()
-        except EOFError:
-            self.__enter__()
-            return "the process died"
-
-
-def _memory(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
+# -- taking them, under bounds ------------------------------------------------------------------------------------
 
 
 class _Guard:
-    """An audit hook that notes what no input may bring about."""
+    """An audit hook that notes what no input may bring about, while there is a folder that cases are in."""
 
     FORBIDDEN = {"os.system", "os.exec", "os.posix_spawn", "pickle.find_class", "socket.connect", "ctypes.dlopen"}
     CHANGES = {"os.mkdir", "os.remove", "os.rename", "os.link", "os.symlink", "os.rmdir", "shutil.rmtree"}
@@ -472,31 +440,17 @@ class _Guard:
             self.noted.append(f"{event} {path}")
 
 
-def serve(pipe: multiprocessing.connection.Connection) -> None:
-    """Take cases from a pipe, each a kind and its files, and answer with what went wrong, or None."""
-    guard, kind, base = _Guard(), None, dict[str, bytes]()
-    signal.signal(signal.SIGALRM, guard.too_late)
-    signal.signal(signal.SIGPROF, guard.too_late)
-    sys.dont_write_bytecode = True
+@functools.cache
+def _guard() -> _Guard:
+    """The hook of this process; Python removes none."""
+    guard = _Guard()
     sys.addaudithook(guard)
-    with tempfile.TemporaryDirectory(prefix="hostile-") as outer, contextlib.suppress(EOFError):
-        folder = Path(os.path.realpath(outer)) / "case"
-        while True:
-            asked, case = pipe.recv()
-            if asked != kind:
-                kind, base = asked, KINDS[asked].base()
-                _warm_up(KINDS[kind], folder, base)
-            _lay(folder, base | case)
-            pipe.send(_take(KINDS[kind].take, folder, guard))
+    return guard
 
 
-def _warm_up(kind: Kind, folder: Path, base: Files) -> None:
-    """Take a sound case without bounds (what is imported or made once for all counts for none), then set them."""
-    resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    _lay(folder, base)
-    with contextlib.suppress(DmcvbError, OSError):
-        kind.take(folder)
-    resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + MEMORY, resource.RLIM_INFINITY))
+def _memory(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 
 
 def _lay(folder: Path, files: Files) -> None:
@@ -508,44 +462,60 @@ def _lay(folder: Path, files: Files) -> None:
         path.write_bytes(data)
 
 
-def _take(take: Callable[[Path], None], folder: Path, guard: _Guard) -> str | None:
-    """What went wrong while a case was taken; None if nothing did."""
-    Path("/proc/self/clear_refs").write_text("5")  # the high-water mark begins anew
-    before, started = _memory("VmRSS"), time.process_time()
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+@contextlib.contextmanager
+def _bounds(guard: _Guard, folder: Path) -> Iterator[None]:
+    """Bounds on memory and time, and the guard, for what is done inside."""
+    handlers = {number: signal.signal(number, guard.too_late) for number in (signal.SIGALRM, signal.SIGPROF)}
+    limit = resource.getrlimit(resource.RLIMIT_AS)
     guard.folder, guard.noted, guard.late = str(folder), [], False
+    resource.setrlimit(resource.RLIMIT_AS, (_memory("VmSize") + MEMORY, limit[1]))
     signal.setitimer(signal.ITIMER_PROF, SECONDS)  # the processor's time: the machine may be busy
     signal.alarm(60)
-    wrong = None
     try:
-        take(folder)
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.alarm(0)
+        guard.folder = None
+        resource.setrlimit(resource.RLIMIT_AS, limit)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def _take(take: Callable[[Path], None], folder: Path) -> str | None:
+    """What went wrong while a case was taken; None if nothing did."""
+    Path("/proc/self/clear_refs").write_text("5")  # the high-water mark begins anew
+    before, guard, wrong = _memory("VmRSS"), _guard(), None
+    try:
+        with _bounds(guard, folder):
+            take(folder)
     except DmcvbError as error:
         wrong = f"a refusal of several lines: {error}" if "\n" in str(error) else None
-    except BaseException:
+    except Exception:
         wrong = traceback.format_exc()[-3000:]
-    signal.setitimer(signal.ITIMER_PROF, 0)
-    signal.alarm(0)
-    guard.folder = None
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    seconds = time.process_time() - started + after.ru_utime - children.ru_utime
-    size = _memory("VmHWM") - before
     if guard.noted:
         return f"it did {guard.noted[:3]}"
-    if wrong is None and (guard.late or seconds > SECONDS):
-        return f"it took {seconds:.0f} s"
+    if wrong is None and guard.late:
+        return f"it took over {SECONDS:.0f} s"
+    size = _memory("VmHWM") - before
     return f"it took {size / 1e6:.0f} MB" if wrong is None and size > MEMORY else wrong
 
 
-def run_kind(taker: Taker, kind: str, examples: int) -> dict[str, str]:
-    """Give `examples` cases of a kind to a taker; each way in which one went wrong, with the first such case."""
+def run_kind(kind: Kind, examples: int, folder: Path) -> dict[str, str]:
+    """Take `examples` cases of a kind in a folder; each way in which one went wrong, with the first such case."""
     ways: dict[str, str] = {}
+    base = kind.base()
+    _lay(folder, base)
+    with contextlib.suppress(DmcvbError, OSError):
+        kind.take(folder)  # what is imported or made once for all counts for none
     lasting = settings(deadline=None, suppress_health_check=list(HealthCheck), database=None, phases=[Phase.generate])
 
     @hypothesis.seed(0)
     @settings(lasting, max_examples=examples)
-    @given(KINDS[kind].cases())
+    @given(kind.cases())
     def every(files):
-        if wrong := taker.take(kind, files):
+        _lay(folder, base | files)
+        if wrong := _take(kind.take, folder):
             shown = {name: data if len(data) < 600 else data[:600] + b"..." for name, data in files.items()}
             ways.setdefault(wrong.strip().splitlines()[-1][:100], f"{wrong}\nof {shown}")
 
