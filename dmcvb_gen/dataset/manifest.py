@@ -34,7 +34,6 @@ ATTACHMENT_FILES = ("README.md", "CHANGELOG.md", "LICENSE", "croissant.json")
 CARD_FOLDER = "card/"
 """Attachments: files of the card, copied as data and no part of the tree. Nothing else may lie in a release."""
 
-SCHEMA_VERSION = 3
 MANIFEST_BYTES, RECIPE_BYTES, COPY_BYTES = 2**26, 2**26, 2**24
 """Largest files of their kind that a reader takes."""
 MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
@@ -433,19 +432,12 @@ def parse(model: type[Parsed], text: bytes, where: str) -> Parsed:
         data = parse_json(text)
     except ValueError as error:
         raise StoreError(f"{where} is not JSON ({error}); fetch it again, or make a new release") from None
-    version = data.get("schema_version", SCHEMA_VERSION) if isinstance(data, dict) else None
-    if isinstance(version, int) and version != SCHEMA_VERSION:
-        cure = (
-            "install a newer dmcvb-gen" if version > SCHEMA_VERSION else "make the release again, or use dmcvb-gen 0.1"
-        )
-        raise StoreError(f"{where} has schema version {version}, and this dmcvb-gen reads {SCHEMA_VERSION}; {cure}")
     try:
-        made = model.model_validate(data)
+        return model.model_validate(data)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the top"
-        raise StoreError(f"{where} is not valid at {place}: {first['msg']}") from None
-    return made
+        first = min(error.errors(), key=lambda one: one["loc"] != ("schema_version",))  # which tells the most
+        place, cure = ".".join(map(str, first["loc"])) or "the top", "fetch it again, or install the dmcvb-gen of it"
+        raise StoreError(f"{where} is not valid at {place}: {first['msg']}; {cure}") from None
 
 
 def record_path(layer: str, shard: int) -> str:
