@@ -408,6 +408,17 @@ class Copy(_Model):
         return frozenset(number for run in self.promised.get(layer, ()) for number in range(*run))
 
 
+def runs(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
+    """Numbers as runs (first, last + 1), in order."""
+    found: list[tuple[int, int]] = []
+    for number in sorted(numbers):
+        if found and found[-1][1] == number:
+            found[-1] = (found[-1][0], number + 1)
+        else:
+            found.append((number, number + 1))
+    return tuple(found)
+
+
 # -- JSON -----------------------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import zarr
 
-from dmcvb_gen.dataset.manifest import ArraySpec, Layer, SubsetRecord
+from dmcvb_gen.dataset.manifest import ArraySpec, Layer, SubsetRecord, runs
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
@@ -382,8 +382,4 @@ class Subset:
 
 
 def _ranges(indices: np.ndarray) -> str:
-    if not len(indices):
-        return "none yet"
-    breaks = np.flatnonzero(np.diff(indices) != 1)
-    starts, ends = np.r_[0, breaks + 1], np.r_[breaks, len(indices) - 1]
-    return ", ".join(f"{indices[a]}..{indices[b]}" for a, b in zip(starts, ends, strict=True))
+    return ", ".join(f"{first}..{last - 1}" for first, last in runs(indices.tolist())) or "none yet"

@@ -49,6 +49,7 @@ from dmcvb_gen.dataset.manifest import (
     parse,
     record_bytes_limit,
     record_path,
+    runs,
 )
 from dmcvb_gen.dataset.schema import array_metadata, encode
 from dmcvb_gen.errors import StoreError
@@ -284,22 +285,11 @@ def plain_metadata(release: Release) -> dict[str, bytes]:
         for name in subset.layers:
             if release.here(name):
                 _add_layer(nodes, release, subset, release.layers[name])
-    texts = {}
-    roots = {path for path in nodes if path.endswith(".zarr")}
-    for path, node in nodes.items():
-        if path in roots:
-            members = {
-                each.removeprefix(f"{path}/"): value for each, value in nodes.items() if each.startswith(f"{path}/")
-            }
-            node = node | {
-                "consolidated_metadata": {
-                    "kind": "inline",
-                    "must_understand": False,
-                    "metadata": dict(sorted(members.items())),
-                }
-            }
-        texts[f"{path}/{ZARR_JSON}"] = canonical_json(node)
-    return texts
+    for path in [path for path in nodes if path.endswith(".zarr")]:
+        members = {each.removeprefix(f"{path}/"): nodes[each] for each in nodes if each.startswith(f"{path}/")}
+        inline = {"kind": "inline", "must_understand": False, "metadata": members}
+        nodes[path] = nodes[path] | {"consolidated_metadata": inline}
+    return {f"{path}/{ZARR_JSON}": canonical_json(node) for path, node in nodes.items()}
 
 
 def _add_layer(nodes: dict[str, dict[str, Any]], release: Release, subset: SubsetRecord, layer: Layer) -> None:
@@ -369,15 +359,7 @@ def _by_layer(shards: Iterable[Shard], numbers: dict[str, set[int]]) -> dict[str
 
 
 def _copy(digest: str, source: str, promised: Mapping[str, Collection[int]]) -> Copy:
-    """What copy.json says, with runs (first, last + 1) of shards."""
-    runs: dict[str, list[list[int]]] = {name: [] for name in sorted(promised)}
-    for name, found in runs.items():
-        for number in sorted(promised[name]):
-            if found and found[-1][1] == number:
-                found[-1][1] += 1
-            else:
-                found.append([number, number + 1])
-    return Copy.model_validate({"manifest": digest, "source": source, "promised": runs})
+    return Copy(manifest=digest, source=source, promised={name: runs(promised[name]) for name in sorted(promised)})
 
 
 # -- provenance -----------------------------------------------------------------------------------

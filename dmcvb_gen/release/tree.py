@@ -31,8 +31,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import NotThere, Store
 
-CARD = tuple(f"{CARD_FOLDER}{name}" for name in ("contact_sheet.png", "episodes.parquet"))
-ATTACHMENTS = (*ATTACHMENT_FILES, *CARD)
+ATTACHMENTS = (*ATTACHMENT_FILES, f"{CARD_FOLDER}contact_sheet.png", f"{CARD_FOLDER}episodes.parquet")
 """Files that are copied with a release as they are; no digest covers them."""
 ATTACHMENT_BYTES, NOTES = 2**30, 100
 """The largest of them, and the number of notes of provenance that go with a release."""
