@@ -14,6 +14,7 @@ import threading
 import tracemalloc
 import uuid
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import zarr
@@ -22,7 +23,7 @@ from hypothesis import strategies as st
 
 from dmcvb_gen.dataset.manifest import ShardFile
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.storage.places import Place, shown
+from dmcvb_gen.storage.places import Place, local_path, shown
 from dmcvb_gen.storage.store import NotThere, open_store
 from dmcvb_gen.storage.zarr_files import ZarrFiles
 from tests.fake_hub import fake_hub
@@ -518,6 +519,15 @@ def test_places_that_lead_nowhere_are_refused(place):
 def test_options_without_an_effect_are_refused(place, words):
     with pytest.raises(DmcvbError, match=words):
         open_store(place, {"key": 1})
+
+
+def test_what_is_no_url_is_a_local_path():
+    for given_path in ("x", "/x/y", "C:/x", "./s3:/x", "a:b/c"):
+        assert local_path(given_path) == Path(given_path)
+    for url in ("s3://user:secret@bucket/x", "file:/tmp/x", "simplecache::s3://b/x", Path("s3://bucket")):
+        with pytest.raises(StoreError, match="is a URL") as caught:
+            local_path(url)
+        assert "secret" not in str(caught.value)
 
 
 @given(st.text())
