@@ -116,7 +116,7 @@ OTHERS = [
     ("publish r s3:/bucket/demo", "did you mean s3://bucket/demo?"),
     ("fetch s3:/bucket/demo --out new", "did you mean s3://bucket/demo?"),
 ]
-WRITING = ["train-behaviour walker-walk --out", "evaluate-behaviour walker-walk --pictures", "import . --out"]
+WRITING = ["train-behaviour walker-walk --out", "import . --out"]
 WRITING += ["export r --to hdf5 --out", *(f"{command} r --out" for command in ("validate", "preview", "card"))]
 WRITING += [f"{command} r --out" for command in ("repaint", "regenerate")]
 OTHERS += [(f"{command} s3://bucket/x", "s3://bucket/x is a URL; give a local one") for command in WRITING]
