@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from dmcvb_gen.errors import DmcvbError
@@ -21,6 +22,8 @@ TASKS = "DMCVB_GEN_TASKS"
 BEHAVIOURS = "DMCVB_GEN_BEHAVIOURS"
 DISTRACTORS = "DMCVB_GEN_DISTRACTORS"
 """Environment variables with the names whose code may run, joined by commas; worker processes inherit them."""
+PLUGINS = "DMCVB_GEN_PLUGINS"
+"""The one with modules that register agents, benchmarks, formats or modalities of your own when they are imported."""
 
 _OWN_ID = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
@@ -66,7 +69,7 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
 
 def permissions() -> dict[str, str]:
     """The environment variables that let code run here, for workers that do not inherit them."""
-    return {name: os.environ[name] for name in (TASKS, BEHAVIOURS, DISTRACTORS) if name in os.environ}
+    return {name: os.environ[name] for name in (TASKS, BEHAVIOURS, DISTRACTORS, PLUGINS) if name in os.environ}
 
 
 def allowed(variable: str) -> list[str]:
@@ -89,14 +92,31 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
     module, _, function = name.partition(":")
     if module == "__main__":
         raise DmcvbError(f"{kind} {name} lies in the script that runs; put it into a module that workers can import")
+    return getattr(_import(module, f"{kind} {name}", function), function)
+
+
+def import_plugins() -> None:
+    """Import the modules that `PLUGINS` names, from the path or the current folder.
+
+    Raises:
+      DmcvbError: one cannot be imported.
+    """
+    for module in allowed(PLUGINS):
+        _import(module, f"{PLUGINS} {module}")
+
+
+def _import(module: str, what: str, function: str | None = None) -> ModuleType:
+    """A module of the user's own, which has that function if one is asked for."""
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     try:
-        return getattr(importlib.import_module(module), function)
+        found = importlib.import_module(module)
+        if function:
+            getattr(found, function)
+        return found
     except (ImportError, AttributeError) as error:
-        raise DmcvbError(
-            f"cannot find {kind} {name} ({error}); give <module>:<function>, run from its folder"
-        ) from None
+        form = "<module>:<function>" if function else "<module>"
+        raise DmcvbError(f"cannot find {what} ({error}); give {form}, run from its folder") from None
     except Exception as error:  # the user's code
         reason = (str(error).splitlines() or [""])[0]
-        raise DmcvbError(f"{kind} {name} cannot be imported ({type(error).__name__}: {reason})") from error
+        raise DmcvbError(f"{what} cannot be imported ({type(error).__name__}: {reason})") from error

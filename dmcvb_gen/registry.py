@@ -1,7 +1,8 @@
 """Registries: tables of named things, to which this package, its users and other packages add.
 
 A thing enters its table when its module is imported, by a decorator. A registry imports the modules of one folder of
-this package, and those that installed packages name in a group of entry points, when it is first asked.
+this package, those that installed packages name in a group of entry points, and those that the environment variable
+DMCVB_GEN_PLUGINS names, when it is first asked.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from importlib import metadata
 from typing import Any, Generic, TypeVar
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.own_code import import_plugins
 
 Thing = TypeVar("Thing")
 _log = logging.getLogger(__name__)
@@ -59,6 +61,7 @@ class Registry(Generic[Thing]):
                     entry.load()
                 except Exception as error:  # one broken package must not stop all others
                     _log.warning("%s %s (%s) cannot be loaded: %s", self.kind, entry.name, entry.value, error)
+            import_plugins()
         return self._things
 
     def get(self, name: str) -> Thing:

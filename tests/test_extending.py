@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +17,8 @@ from click.testing import CliRunner
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import Release
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.registry import Registry
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "docs" / "examples" / "extending"
@@ -87,11 +92,28 @@ def validated(release, tmp_path, *options) -> dict:
 @pytest.mark.slow_cases("small_mazes-*/visible", "small_release-*/none")
 @pytest.mark.parametrize("family, only", [("small_release", "*/none"), ("small_mazes", "*/visible")])
 def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family, only, request, tmp_path):
-    load("agent")
+    """Its file is named in the environment, so the processes that train it import it, too."""
     agents = ["linear-bc", "state-linear-bc", "id+linear-bc:power=1"]
-    report = validated(request.getfixturevalue(family), tmp_path, "--agents", ",".join(agents), "--only", only)
+    words = ["--profile", "smoke", "--workers", "2", "--out", tmp_path, "--agents", ",".join(agents), "--only", only]
+    command = [sys.executable, "-m", "dmcvb_gen", "validate", request.getfixturevalue(family), *words]
+    environment = os.environ | {"DMCVB_GEN_PLUGINS": "agent", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, cwd=EXAMPLES, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
     assert {result["cell"]["agent"] for result in report["results"]} == set(agents) and not report["failed"]
     assert all(result["curve"][-1]["loss"] > 0 for result in report["results"])
+
+
+@pytest.mark.parametrize(
+    "text, told", [(None, "cannot find DMCVB_GEN_PLUGINS mine"), ("1 / 0", "cannot be imported (ZeroDivisionError")]
+)
+def test_a_plugin_that_cannot_be_imported_is_told_in_one_line(text, told, tmp_path, monkeypatch):
+    monkeypatch.setenv("DMCVB_GEN_PLUGINS", "mine")
+    monkeypatch.chdir(tmp_path)
+    if text:
+        (tmp_path / "mine.py").write_text(text)
+    with pytest.raises(DmcvbError, match=re.escape(told)):
+        Registry("agent", "dmcvb_gen.agents", "none").all()
 
 
 @pytest.mark.slow_cases("small_mazes", "small_release")
