@@ -160,10 +160,8 @@ def videos_by_split(source: str | Path) -> dict[str, int] | None:
 def _listed(folder: Path) -> list[Path]:
     """List a folder without hidden files; numbers in names are ordered by value."""
 
-    def key(path: Path):
-        return [
-            (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)
-        ], path.name
+    def key(path: Path):  # numbers at the odd places, words at the even ones
+        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)], path.name
 
     return sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=key)
 

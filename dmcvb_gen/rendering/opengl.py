@@ -19,9 +19,8 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import Renderer, Views, check_frames, check_size, empty_labels, moved_lamps
+from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, moved_lamps
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
@@ -110,9 +109,7 @@ class OpenglRenderer(Renderer):
         self._terrain_changes = task.draws_terrain or "hfield_data" in task.model_entries
         self._shown: tuple[int, int] = (-1, -1)
 
-    def render(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
-    ) -> np.ndarray:
+    def render(self, physics, exogenous, views=None, hide_goal=False):
         indices = check_frames(self.task, physics, exogenous, views)
         out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
         self._painter._gl_context.make_current()
@@ -125,10 +122,7 @@ class OpenglRenderer(Renderer):
                 out[frame, column] = self._shoot(view, exogenous.camera_position[frame], rotations[frame])
         return out
 
-    def render_labels(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
-    ) -> dict[str, np.ndarray]:
-        """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
+    def render_labels(self, physics, exogenous, views=None, hide_goal=False):
         indices = check_frames(self.task, physics, exogenous, views)
         depth, segmentation = empty_labels(len(physics), len(indices), self.size)
         self._painter._gl_context.make_current()

@@ -31,6 +31,9 @@ ACTION_REPEAT = 2
 """Control steps an agent step (paper, section 3.2), unless a recipe says otherwise."""
 ACTION_REPEATS = (1, 2, 4)
 """What recipes may ask for."""
+Generators = Sequence[np.random.Generator]
+Places = np.ndarray | Sequence[int] | None
+"""Indices in a batch; None: all of it."""
 
 PHYSICS_SPEC = int(
     mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -262,7 +265,7 @@ class EpisodeBatch(abc.ABC):
         self._all = np.arange(size)
 
     @abc.abstractmethod
-    def _start(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+    def _start(self, ids: np.ndarray, generators: Generators) -> None:
         """Start new episodes in the simulations `ids`, one generator each."""
 
     @abc.abstractmethod
@@ -274,7 +277,7 @@ class EpisodeBatch(abc.ABC):
         """(size, physics) float64: the states to set back into MuJoCo (`task.physics_spec`), then model entries."""
 
     @abc.abstractmethod
-    def set_physics(self, physics: np.ndarray, ids: np.ndarray | Sequence[int] | None = None) -> np.ndarray:
+    def set_physics(self, physics: np.ndarray, ids: Places = None) -> np.ndarray:
         """Put simulations into stored physics states; gives all states (size, state).
 
         Args:
@@ -301,9 +304,7 @@ class EpisodeBatch(abc.ABC):
         """(size, behaviour_size) float32: what behaviour policies see, `task.observation`; the state by default."""
         return self.state().astype(np.float32)
 
-    def reset(
-        self, generators: Sequence[np.random.Generator], ids: np.ndarray | Sequence[int] | None = None
-    ) -> np.ndarray:
+    def reset(self, generators: Generators, ids: Places = None) -> np.ndarray:
         """Start new episodes.
 
         Args:
@@ -320,12 +321,7 @@ class EpisodeBatch(abc.ABC):
             self._start(ids, generators)
         return self.state()
 
-    def reset_fixed(
-        self,
-        generators: Sequence[np.random.Generator],
-        pairs: Sequence[tuple],
-        ids: np.ndarray | Sequence[int] | None = None,
-    ) -> np.ndarray:
+    def reset_fixed(self, generators: Generators, pairs: Sequence[tuple], ids: Places = None) -> np.ndarray:
         """Do as `reset` at given (start, goal) cells, which mazes have.
 
         Raises:
@@ -362,7 +358,7 @@ class PhysicsBatch(EpisodeBatch):
     # -- what a task must say ---------------------------------------------------------------
 
     @abc.abstractmethod
-    def _initialize(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+    def _initialize(self, ids: np.ndarray, generators: Generators) -> None:
         """Set the initial physics state of the simulations `ids`, one generator each; end with `_refresh`."""
 
     @abc.abstractmethod
@@ -444,7 +440,7 @@ def physics_columns(model: mujoco.MjModel, spec: int = PHYSICS_SPEC) -> np.ndarr
     return columns.astype(int)
 
 
-def tolerance(x, lower=0.0, upper=0.0, margin=1.0, sigmoid="gaussian", value_at_margin=0.1):
+def tolerance(x, lower, upper=np.inf, margin=1.0, sigmoid="gaussian", value_at_margin=0.1):
     """1 where x lies in [lower, upper], falling to `value_at_margin` at `margin` outside (elementwise).
 
     The reward shape of the DeepMind Control Suite, for arrays: sigmoid "gaussian", "linear" or "quadratic".

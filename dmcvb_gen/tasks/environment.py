@@ -209,12 +209,11 @@ class EnvironmentTask(Task):
                 f"{self.id} holds a random generator with a fixed seed, which begins every episode alike; draw from "
                 "self.random"
             )
-        for before, after in ((one, one_again), (two, two_again)):
-            if reason := before.differs(after):
-                raise DmcvbError(
-                    f"{self.id} gives another {reason} for the same seed; draw every random number from self.random, "
-                    "and keep nothing outside of the environment"
-                )
+        if one.differs(one_again) or two.differs(two_again):
+            raise DmcvbError(
+                f"{self.id} gives another episode for the same seed; draw every random number from self.random, and "
+                "keep nothing outside of the environment"
+            )
         first, second = PROBE_SEEDS
         pairs = [(two, _Probe(self, one.environment, second)), (one, _Probe(self, one.environment, first))]
         self.reusable = all(new.kept and new.kept == used.kept and not new.differs(used) for new, used in pairs)
@@ -293,16 +292,12 @@ class _Probe:
         """Names of the model's fields that are ever other than in `start`."""
         return {name for model in self.models for name in start if not same(model[name], start[name])}
 
-    def differs(self, other: _Probe) -> str | None:
-        """What is not the same in another run of the same episode; None if all is."""
-        rows = zip(self._rows, other._rows, strict=False)
-        if len(self._rows) != len(other._rows) or not all(same(one, two) for one, two in rows):
-            return "episode"
-        for one, two in zip(self.models, other.models, strict=True):
-            for name in one:
-                if not same(one[name], two[name]):
-                    return f"{name} of the model"
-        return None
+    def differs(self, other: _Probe) -> bool:
+        """Return True if another run of the same episode is not the same in all."""
+        ours, theirs = (
+            [*probe._rows, *(value for model in probe.models for value in model.values())] for probe in (self, other)
+        )
+        return len(ours) != len(theirs) or not all(map(same, ours, theirs))
 
 
 def same(one: np.ndarray, two: np.ndarray) -> bool:

@@ -7,13 +7,12 @@ batch. dm_control is the authority: from the same physics state and actions they
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
 from dmcvb_gen import arithmetic
-from dmcvb_gen.tasks.base import PhysicsBatch, Task, tolerance
+from dmcvb_gen.tasks.base import Generators, PhysicsBatch, Task, tolerance
 from dmcvb_gen.tasks.suite import suite_folder
 
 EPISODE_STEPS = 500
@@ -66,7 +65,7 @@ class LocomotionBatch(PhysicsBatch):
         """Velocity of the centre of mass, m/s, (size, 3)."""
         return self._sensors[:, self._velocity : self._velocity + 3]
 
-    def _randomize_joints(self, ids: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+    def _randomize_joints(self, ids: np.ndarray, generators: Generators) -> None:
         """Limited joints uniform in their range, free hinges in [-pi, pi], free bodies turned at random.
 
         The free joint's quaternion is drawn from the unit cube and normalized, as dm_control does.
@@ -103,17 +102,10 @@ class WalkerBatch(LocomotionBatch):
         return np.concatenate([orientations, self.torso_height()[:, None], self._qvel], axis=1)
 
     def _control_reward(self):
-        standing = tolerance(self.torso_height(), WALKER_STAND_HEIGHT, np.inf, margin=WALKER_STAND_HEIGHT / 2)
+        standing = tolerance(self.torso_height(), WALKER_STAND_HEIGHT, margin=WALKER_STAND_HEIGHT / 2)
         upright = (1 + self.torso_upright()) / 2
-        stand = (3 * standing + upright) / 4
-        move = tolerance(
-            self.com_velocity()[:, 0],
-            WALKER_SPEED,
-            np.inf,
-            margin=WALKER_SPEED / 2,
-            value_at_margin=0.5,
-            sigmoid="linear",
-        )
+        stand, speed = (3 * standing + upright) / 4, self.com_velocity()[:, 0]
+        move = tolerance(speed, WALKER_SPEED, margin=WALKER_SPEED / 2, value_at_margin=0.5, sigmoid="linear")
         return stand * (5 * move + 1) / 6
 
 
@@ -150,7 +142,7 @@ class CheetahBatch(LocomotionBatch):
 
     def _control_reward(self):
         speed = self.com_velocity()[:, 0]
-        return tolerance(speed, CHEETAH_SPEED, np.inf, margin=CHEETAH_SPEED, value_at_margin=0, sigmoid="linear")
+        return tolerance(speed, CHEETAH_SPEED, margin=CHEETAH_SPEED, value_at_margin=0, sigmoid="linear")
 
 
 class CheetahRun(LocomotionTask):
@@ -195,31 +187,15 @@ class HumanoidBatch(LocomotionBatch):
         return turned.reshape(self.size, 12)
 
     def state(self):
-        return np.concatenate(
-            [
-                self.com_velocity(),
-                self.extremities(),
-                self.head_height()[:, None],
-                self._qpos[:, 7:],
-                self._xmat[:, self._torso, 6:9],
-                self._qvel,
-            ],
-            axis=1,
-        )
+        torso = self.com_velocity(), self.extremities(), self.head_height()[:, None]
+        return np.concatenate([*torso, self._qpos[:, 7:], self._xmat[:, self._torso, 6:9], self._qvel], axis=1)
 
     def _control_reward(self):
-        standing = tolerance(self.head_height(), HUMANOID_STAND_HEIGHT, np.inf, margin=HUMANOID_STAND_HEIGHT / 4)
-        upright = tolerance(self.torso_upright(), 0.9, np.inf, margin=1.9, value_at_margin=0, sigmoid="linear")
-        control = tolerance(self._ctrl, margin=1, value_at_margin=0, sigmoid="quadratic").mean(axis=1)
-        small_control = (4 + control) / 5
-        move = tolerance(
-            arithmetic.norm(self.com_velocity()[:, :2]),
-            HUMANOID_SPEED,
-            np.inf,
-            margin=HUMANOID_SPEED,
-            value_at_margin=0,
-            sigmoid="linear",
-        )
+        standing = tolerance(self.head_height(), HUMANOID_STAND_HEIGHT, margin=HUMANOID_STAND_HEIGHT / 4)
+        upright = tolerance(self.torso_upright(), 0.9, margin=1.9, value_at_margin=0, sigmoid="linear")
+        control = tolerance(self._ctrl, 0.0, 0.0, value_at_margin=0, sigmoid="quadratic").mean(axis=1)
+        small_control, speed = (4 + control) / 5, arithmetic.norm(self.com_velocity()[:, :2])
+        move = tolerance(speed, HUMANOID_SPEED, margin=HUMANOID_SPEED, value_at_margin=0, sigmoid="linear")
         return small_control * standing * upright * (5 * move + 1) / 6
 
 

@@ -26,6 +26,9 @@ ROLLOUTS = [
     (f"{TINY_MAZE} --level randm", "Did you mean 'random'?"),
     ("walker-walk --distractor fog", "dynamic"),
     ("walker-walk --distracter none", "Did you mean '--distractor'?"),
+    ("walker-walk --distractor static_cue0.5", "has no cue, shake or light"),
+    ("walker-walk --distractor math:Nothing", "cannot find distractor math:Nothing"),
+    ("walker-walk --distractor math:pi_hard", "is no distractor 'pi'"),
     ("walker-walk --size 0", "8 to 1024"),
     ("walker-walk --samples 3", "samples: Input should be 1, 2, 4 or 8"),
     ("walker-walk --renderer povray", "opengl"),
@@ -144,6 +147,7 @@ def place(tmp_path_factory, small_release):
 
 @pytest.mark.parametrize("words, cure", [(f"rollout {words} --out new", cure) for words, cure in ROLLOUTS] + OTHERS)
 def test_a_mistake_is_answered_in_a_line_with_the_cure_and_nothing_is_written(place, monkeypatch, words, cure):
+    monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", "")
     monkeypatch.chdir(place)
     before = sorted(place.iterdir())
     said = invoke(*words.split(), code=2).output

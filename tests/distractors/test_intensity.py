@@ -6,12 +6,10 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
 import dmcvb_gen
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.loaders.envs import DistractedEnv
@@ -146,24 +144,6 @@ def test_a_release_of_them_goes_the_whole_way(task_id, tmp_path):
     actions = np.zeros((2, get_task(task_id).action_size))
     score = dmcvb_gen.evaluate(lambda seen: actions, f"{task_id}/static_0.35", episodes=2, max_steps=2, size=16)
     assert len(score.returns) == 2
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["walker-walk", "--distractor", "dynamic_sky0.1"], "unknown difficulty 'sky0.1'"),
-        (["walker-walk", "--distractor", "static_cue0.5"], "has no cue, shake or light"),
-        (["ant-maze-empty7x7", "--distractor", "dynamic_background2"], "--distractor has no effect in mazes"),
-        (["walker-walk", "--distractor", "dynamic_2"], "is not above 0 and up to 1"),
-        (["walker-walk", "--distractor", "math:Nothing"], "cannot find distractor math:Nothing"),
-        (["walker-walk", "--distractor", "math:pi_hard"], "is no distractor 'pi'"),
-    ],
-)
-def test_what_has_no_effect_or_sense_is_one_line(options, message, tmp_path, monkeypatch):
-    monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", "")
-    done = CliRunner().invoke(main, ["rollout", *options, "--out", str(tmp_path / "r")])
-    assert done.exit_code == 2 and message in done.output and done.output.count("\n") == 1, done.output
-    assert not (tmp_path / "r").exists()
 
 
 # -- a spurious cue -------------------------------------------------------------------------------

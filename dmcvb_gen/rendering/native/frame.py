@@ -64,9 +64,7 @@ class Scratch(NamedTuple):
     behind_number: np.ndarray
     rec: np.ndarray  # (geom, layout.WIDTH)
     k: np.ndarray  # (layout.LENGTH,)
-    plane: (
-        np.ndarray
-    )  # float32, the lit plane's grid (2, line), the lamp's color at its vertices (x, y, 3), all lights'
+    plane: np.ndarray  # float32, the lit plane's grid (2, line), the lamp's color at its vertices, then all lights'
     s: np.ndarray  # see layout
     jobs: np.ndarray  # int32, see above
     color: np.ndarray  # float32, (3, room) of each job, then the sky's (3, pixels^2)

@@ -66,14 +66,10 @@ class NativeRenderer(Renderer):
     def describe(self) -> dict[str, Any]:
         return super().describe() | {"version": VERSION}
 
-    def render(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
-    ) -> np.ndarray:
+    def render(self, physics, exogenous, views=None, hide_goal=False):
         return self._paint(physics, exogenous, views, not hide_goal, hide_goal)[int(hide_goal)]
 
-    def render_pair(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def render_pair(self, physics, exogenous, views=None):
         """See `Renderer`; the second ones are painted again only where the goal is."""
         return self._paint(physics, exogenous, views, True, True)
 
@@ -94,10 +90,7 @@ class NativeRenderer(Renderer):
                         whole[rows, column] = part
         return out[0], out[1]
 
-    def render_labels(
-        self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
-    ) -> dict[str, np.ndarray]:
-        """Depth (frame, view, size, size) float32 in meters (0: sky) and segmentation int16 (geom id, -1: sky)."""
+    def render_labels(self, physics, exogenous, views=None, hide_goal=False):
         indices = check_frames(self.task, physics, exogenous, views)
         depth, segmentation = empty_labels(len(physics), len(indices), self.size)
         numbers = np.append(self._scene.geoms, -1).astype(np.int16)

@@ -34,6 +34,7 @@ def level_sizes(width: int, height: int) -> list[tuple[int, int]]:
     return sizes
 
 
+@lru_cache
 def _taps(old: int, new: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return, for each of `new` texels along a side, the two old ones around it and the weight of the second."""
     center = (np.arange(new) + 0.5) * old / new - 0.5
@@ -103,8 +104,13 @@ def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.nd
         sizes = {"narrow": SKY_WIDTH * SKY_WIDTH, "tall": SKY_WIDTH * SKY_WIDTH, "all": total}
         room.update({name: np.empty(size, np.int32) for name, size in sizes.items()})
     across, down = taps(columns, SKY_WIDTH), taps(rows, SKY_WIDTH)
-    call(make_sky, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], room["all"])
-    return room["all"]
+    call(make_sky, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], out := room["all"])
+    at, side = 0, SKY_WIDTH
+    while side % 2 == 0:
+        at, side = at + side * side, side // 2
+    smallest = out[at : at + side * side].view(np.uint8).reshape(side, side, 4)[..., :3]
+    out[at:] = np.concatenate([packed(level) for level in levels(smallest)])
+    return out
 
 
 class Textures:
@@ -254,37 +260,9 @@ def halve(texels, side, out):
             put(out, to + x, i4(((sides >> 2) & apart) | ((middle >> 2) << 8)))
 
 
-@part
-def shrink(texels, side, out):
-    """(side * side) texels of an odd side made (side // 2)^2, each the blend of the four around its center."""
-    less = side // 2
-    for row in range(less):
-        y = (row + 0.5) * side / less - 0.5
-        top = int(np.floor(y))
-        down = f4(y - top)
-        for column in range(less):
-            x = (column + 0.5) * side / less - 0.5
-            left = int(np.floor(x))
-            across, color = f4(x - left), i4(0)
-            for shift in range(0, 24, 8):
-                a, b = channel(texels, side * top + left, shift), channel(texels, side * top + left + 1, shift)
-                at = side * (top + 1) + left
-                c, d = channel(texels, at, shift), channel(texels, at + 1, shift)
-                near, far = a * (f4(1) - down) + c * down, b * (f4(1) - down) + d * down
-                value = np.floor(near * (f4(1) - across) + far * across + f4(0.5))
-                color |= i4(i4(value) << shift)
-            out[less * row + column] = color
-
-
-@leaf
-def channel(texels, at, shift):
-    """A channel of a texel, as a float."""
-    return f4(i4((texels[at] >> shift) & 255))
-
-
 @entry
 def make_sky(picture, across, across_weight, down, down_weight, narrow, tall, out):
-    """Make of (rows, columns, 3) uint8 the texels of `side` * `side` and of all smaller levels, one after another."""
+    """Make of (rows, columns, 3) uint8 the texels of `side` * `side` and of each half of it, up to an odd side."""
     rows, columns, side = picture.shape[0], picture.shape[1], down.size
     for row in range(rows):
         for x in range(columns):
@@ -293,9 +271,6 @@ def make_sky(picture, across, across_weight, down, down_weight, narrow, tall, ou
     widen(narrow, across, across_weight, rows, columns, side, tall)
     heighten(tall, down, down_weight, side, side, out)
     at = 0
-    while side > 1:
-        if side % 2 == 0:
-            halve(out[at : at + side * side], side // 2, out[at + side * side :])
-        else:
-            shrink(out[at : at + side * side], side, out[at + side * side :])
+    while side % 2 == 0:
+        halve(out[at : at + side * side], side // 2, out[at + side * side :])
         at, side = at + side * side, side // 2

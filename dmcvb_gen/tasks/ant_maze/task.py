@@ -26,7 +26,7 @@ from dmcvb_gen.tasks.ant_maze.arena import (
 )
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, make_field
 from dmcvb_gen.tasks.ant_maze.layouts import Layout
-from dmcvb_gen.tasks.base import ACTION_REPEAT, PhysicsBatch, Task
+from dmcvb_gen.tasks.base import ACTION_REPEAT, Generators, PhysicsBatch, Places, Task
 
 EPISODE_STEPS, EVALUATION_STEPS = 600, 1000
 """Agent steps of 30 seconds (data) and of 60 seconds (online evaluation)."""
@@ -119,12 +119,7 @@ class AntMazeBatch(PhysicsBatch):
             self._place(sim, rng, free[start], free[goal + (goal >= start)])
         self._refresh(ids)
 
-    def reset_fixed(
-        self,
-        generators: Sequence[np.random.Generator],
-        pairs: Sequence[tuple],
-        ids: np.ndarray | Sequence[int] | None = None,
-    ) -> np.ndarray:
+    def reset_fixed(self, generators: Generators, pairs: Sequence[tuple], ids: Places = None) -> np.ndarray:
         """Start episodes at given (start, goal) cells; offsets and yaw are drawn as ever.
 
         Returns:
