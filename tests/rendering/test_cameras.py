@@ -12,6 +12,7 @@ import pytest
 from dmcvb_gen.tasks import cameras, get_task
 from dmcvb_gen.tasks.cameras import Kinematics, centers_of_mass, matrices, nominal_cameras, quaternions
 from tests.conftest import TINY_MAZE
+from tests.distractors.test_distractors import physics_of
 from tests.tasks import hostile_tasks as h
 from tests.tasks.test_own_tasks import task_of
 
@@ -19,18 +20,10 @@ TASKS = ("walker-walk", TINY_MAZE, h.sleeping, h.drawn_model, h.DrawsItsModel)
 FIELDS = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "subtree_com")
 
 
-def some_states(task, count):
-    batch = task.batch(count)
-    batch.reset([np.random.default_rng(i) for i in range(count)])
-    for _ in range(3):
-        batch.step(np.random.default_rng(9).uniform(-1, 1, (count, task.action_size)))
-    return batch.physics()
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task):
     task = get_task(task) if isinstance(task, str) else task_of(task)
-    physics = some_states(task, 5)
+    physics = physics_of(task, 5, 4)[:, -1]
     together = Kinematics(task, FIELDS)(physics)
     data, model = mujoco.MjData(task.model), copy.deepcopy(task.model)
     for frame, state in enumerate(physics):
@@ -48,14 +41,14 @@ def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task):
 
 def test_more_states_than_a_batch_holds_have_their_own_poses():
     task = type(get_task("walker-walk"))()  # for which no batch is kept
-    few = some_states(task, 3)
+    few = physics_of(task, 3, 4)[:, -1]
     expected, many = centers_of_mass(task, few), np.tile(few, (cameras.CHUNK // 2, 1))
     np.testing.assert_array_equal(centers_of_mass(task, many), np.tile(expected, (cameras.CHUNK // 2, 1)))
 
 
 def test_threads_get_their_own_states_poses():
     task = get_task("walker-walk")
-    physics = some_states(task, 8)
+    physics = physics_of(task, 8, 4)[:, -1]
     expected = [centers_of_mass(task, state[None]) for state in physics]
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda i: centers_of_mass(task, physics[i % 8][None]), range(400)))
