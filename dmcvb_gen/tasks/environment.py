@@ -319,10 +319,8 @@ def _bounds(id: str, environment: Any) -> tuple[np.ndarray, np.ndarray]:
             f"{id} takes {dtype} of shape {shape} as actions; give it actuators, and one row of numbers that drives "
             "them"
         )
-    low, high = (
-        np.broadcast_to(np.asarray(getattr(spec, name, default), float), shape)
-        for name, default in (("minimum", -np.inf), ("maximum", np.inf))
-    )
+    low = np.broadcast_to(getattr(spec, "minimum", -np.inf), shape).astype(float)
+    high = np.broadcast_to(getattr(spec, "maximum", np.inf), shape).astype(float)
     lowest, highest = low <= -mujoco.mjMAXVAL, high >= mujoco.mjMAXVAL  # none, that is
     low = np.where(lowest, np.minimum(-1, high - 2), low)
     high = np.where(highest, np.maximum(1, low + 2), high)
