@@ -11,7 +11,7 @@ from dmcvb_gen.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from dmcvb_gen.benchmarks.evaluate import Score
+    from dmcvb_gen.benchmarks.evaluate import evaluate
     from dmcvb_gen.benchmarks.validate import validate
     from dmcvb_gen.generate.returns import evaluate_behaviour
     from dmcvb_gen.loaders.release import ReleaseReader
@@ -47,6 +47,7 @@ ROOMS = {
     "release.publish": ("publish",),
     "release.fetch": ("fetch",),
     "release.export": ("export",),
+    "benchmarks.evaluate": ("evaluate",),
     "benchmarks.validate": ("validate",),
 }
 """Module -> its public functions, imported when they are used, so that a command loads only what it needs."""
@@ -85,30 +86,17 @@ def open(
     Raises:
       StoreError: there is no release, it cannot be read, it has another digest, or the URL needs a package that is
         not installed.
-      DmcvbError: `painting` has an unknown value.
+      DmcvbError: `painting` has an unknown value, or all of the release was imported.
+      TypeError: `painting` has an unknown field.
     """
     if paint or painting:
-        from dmcvb_gen.loaders.painted import open_painted
+        from dmcvb_gen.dataset.gate import Release
+        from dmcvb_gen.loaders.painted import Painting, painted_release
 
-        return open_painted(path, storage_options, digest, **painting)
+        return painted_release(Release.open(path, storage_options, digest), Painting(**painting))
     from dmcvb_gen.loaders.release import open_for_reading
 
     return open_for_reading(path, storage_options, digest)
-
-
-def evaluate(policy: Any, where: Any, **options: Any) -> Score:
-    """Score a policy of your own: `dmcvb_gen.evaluate(policy, "walker-walk/dynamic", episodes=30, seed=0)`.
-
-    A subset instead of a name gives its size, renderer, videos and time limit, and a score that is normalized.
-    The protocol, starts and videos are those of `validate`. See `dmcvb_gen.benchmarks.evaluate.evaluate` for what the
-    policy gets and gives, and for all options.
-
-    Raises:
-      DmcvbError: no such task or setting, or actions that have another shape, are no numbers or leave their bounds.
-    """
-    from dmcvb_gen.benchmarks.evaluate import evaluate as run
-
-    return run(policy, where, **options)
 
 
 register_with_gymnasium()  # so that gymnasium.make knows our names wherever this package is imported

@@ -35,9 +35,7 @@ class UnknownNameError(DmcvbError, KeyError):
         hint = f" Did you mean {near[0]!r}?" if near else ""
         listed, rest = known, ""
         if len(known) > MOST_LISTED:
-            most = MOST_LISTED // 3
-            near_ones = difflib.get_close_matches(str(name), known, n=most, cutoff=0.3)
-            listed = [*near_ones, *(other for other in known if other not in near_ones)][:most]
+            listed = difflib.get_close_matches(str(name), known, n=MOST_LISTED // 3, cutoff=0)
             rest = f" and {len(known) - len(listed)} more{cure and f'; {cure}'}"
         super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(listed)}{rest}.")
 

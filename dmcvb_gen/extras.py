@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 EXTRAS = {
     "train": ("torch", "stable_baselines3", "sb3_contrib"),
     "pictures": ("imageio_ffmpeg", "matplotlib"),
@@ -47,11 +45,3 @@ def install_hint(module: str) -> str | None:
     if top in SIMULATOR or top in _PACKAGES:
         return f"this needs {package}, which is not installed: pip install {package} (a whole install brings it)"
     return None
-
-
-def installed(module: str) -> bool:
-    """Return True if a module can be imported, without importing it."""
-    try:
-        return find_spec(module) is not None
-    except (ImportError, ValueError):
-        return False

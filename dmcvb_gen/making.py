@@ -27,7 +27,7 @@ from dmcvb_gen.options import (
 )
 from dmcvb_gen.parallel import Workers, ignore
 from dmcvb_gen.spec import is_maze, subset_name
-from dmcvb_gen.text import as_names, quoted
+from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
     from dmcvb_gen.generate.paint import RenderResult
@@ -224,12 +224,8 @@ def paint(
     """
     from dmcvb_gen.generate.paint import Wanted, paint_release
     from dmcvb_gen.generate.request import background_source
-    from dmcvb_gen.storage.places import is_url, local_path, shown
+    from dmcvb_gen.storage.places import local_path
 
-    if is_url(str(release)):
-        url = shown(str(release))
-        cure = f"fetch and render it: dmcvb-gen fetch {quoted(url)} --paint --out FOLDER"
-        raise DmcvbError(f"{url} is a URL; give a local one, or {cure}")
     wanted = Wanted(size, None if views is None else as_names(views), goal)
     videos = None if backgrounds is None else background_source(backgrounds)
     with progress_bar(progress, " frames") as bar:

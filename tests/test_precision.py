@@ -10,9 +10,7 @@ from click.testing import CliRunner
 
 from dmcvb_gen import precision
 from dmcvb_gen.cli import main
-from dmcvb_gen.training import sac
 from dmcvb_gen.training.run import read_config
-from dmcvb_gen.training.settings import default_run
 
 SMALL = ("warmup_steps=8", "simulations=4", "batch_size=8", "compile=false")
 SHORT = ["--steps=12", *(f"--set={pair}" for pair in SMALL)]
@@ -53,8 +51,3 @@ def test_a_run_says_and_records_what_auto_chose(tmp_path, monkeypatch, fast):
     assert run.exit_code == 0, run.output
     assert f", {fast}: " in run.stderr
     assert read_config(tmp_path / "run").settings["bfloat16"] == (fast == "bfloat16")
-
-
-def test_settings_that_nothing_probed_compute_in_float32():
-    assert not sac.Settings().bfloat16
-    assert all("bfloat16" not in default_run(task)["settings"] for task in ("walker-walk", "ant-maze-empty7x7"))

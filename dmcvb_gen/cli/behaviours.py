@@ -1,20 +1,20 @@
 """train-behaviour, select-checkpoints, evaluate-behaviour."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json
 import shutil
 import textwrap
 from pathlib import Path
+from typing import Any, Literal
 
 import click
 
-from dmcvb_gen.cli.common import INTERRUPTED, OutPath, answer, json_option, print_json, print_table
+from dmcvb_gen.cli.common import INTERRUPTED, answer, json_option, print_json, print_table
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.generate.returns import evaluate_behaviour as evaluate
+from dmcvb_gen.options import Local, Location
 from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.text import quoted
 from dmcvb_gen.training.behaviour import train_behaviour as train
@@ -143,27 +143,41 @@ def _tell(sentence):
     click.echo(textwrap.fill(sentence, shutil.get_terminal_size().columns, subsequent_indent="  "))
 
 
-@click.command("convert-policy")
-@click.argument("source", type=click.Path(path_type=Path))
-@click.argument("task")
-@click.option("--out", type=OutPath(path_type=Path), required=True, help="Policy file to write (.safetensors).")
-@click.option("--level", type=click.Choice(["expert", "medium", "mixed"]), help="Level to note in the file.")
-@click.option(
-    "--activation",
-    type=click.Choice(["relu", "tanh", "elu", "gelu"]),
-    help="Of hidden layers.  [default: the program's]",
-)
-@click.option(
-    "--actions",
-    "distribution",
-    type=click.Choice(["tanh", "clip"]),
-    help="Plain networks: how the output becomes an action in [-1, 1].",
-)
-@click.option(
-    "--statistics", type=click.Path(path_type=Path), help='.npz with "mean" and "std" of normalized observations.'
-)
-@json_option
-def convert_policy(source, task, out, level, activation, distribution, statistics, as_json):
+def _converted(
+    source: Location,
+    task: str,
+    *,
+    out: Local,
+    level: Literal["expert", "medium", "mixed"] | None = None,
+    activation: Literal["relu", "tanh", "elu", "gelu"] | None = None,
+    actions: Literal["tanh", "clip"] | None = None,
+    statistics: Location | None = None,
+) -> Any:
+    """Convert another program's policy; gives the header of the file.
+
+    Args:
+      source (SOURCE): The policy: a zip of Stable-Baselines3, or a torch state dict.
+      task (TASK): Task that it acts in.
+      out (FILE): Policy file to write (.safetensors).
+      level: Level to note in the file.
+      activation: Of hidden layers. [default: the program's]
+      actions: Plain networks: how the output becomes an action in [-1, 1].
+      statistics (FILE): .npz with "mean" and "std" of normalized observations.
+    """
+    from dmcvb_gen.own_code import allow
+    from dmcvb_gen.policies.bundled import CONVERTED
+    from dmcvb_gen.policies.convert import convert_file
+
+    allow([task])  # a person typed its name, so its code may run
+    if Path(out).suffix in CONVERTED:
+        raise PolicyFileError(f"--behaviour would take {out} for another program's file; end its name in .safetensors")
+    distribution = actions and {"tanh": "deterministic", "clip": "gaussian"}[actions]
+    options = dict(level=level, activation=activation, distribution=distribution, statistics=statistics)
+    return convert_file(Path(source), task, Path(out), **options)
+
+
+@command_of(_converted, "source", "task")
+def convert_policy(as_json, progress, **options):
     """Convert another program's policy to a policy file: a Stable-Baselines3 zip or a torch state dict (CleanRL).
 
     Weights are read without unpickling anything. Data of a converted policy regenerate bit for bit. CleanRL's SAC keeps
@@ -175,24 +189,9 @@ def convert_policy(source, task, out, level, activation, distribution, statistic
         --out hopper-hop.safetensors
     dmcvb-gen rollout walker-run --behaviour walker-run.safetensors
     """
-    from dmcvb_gen.own_code import allow
-    from dmcvb_gen.policies.bundled import CONVERTED
-    from dmcvb_gen.policies.convert import convert_file
-
-    allow([task])  # a person typed its name, so its code may run
-    if out.suffix in CONVERTED:
-        raise PolicyFileError(f"--behaviour would take {out} for another program's file; end its name in .safetensors")
-    header = convert_file(
-        source,
-        task,
-        out,
-        level=level,
-        activation=activation,
-        distribution=distribution and {"tanh": "deterministic", "clip": "gaussian"}[distribution],
-        statistics=statistics,
-    )
+    header = _converted(**options)
     layers = " x ".join(map(str, (header.observation_size, *header.hidden, header.action_size)))
-    wrote = f"wrote {out}: {layers}, {header.activation}, {header.distribution}"
+    wrote = f"wrote {options['out']}: {layers}, {header.activation}, {header.distribution}"
     answer(as_json, header.model_dump(mode="json"), wrote)
 
 

@@ -42,10 +42,10 @@ class GroupedCommand(click.Command):
 def print_table(
     columns: Sequence[str], rows: Iterable[Sequence[str]], title: str = "", optional: Sequence[tuple[str, ...]] = ()
 ) -> None:
-    """Print a table that no terminal cuts: names on the left, numbers on the right.
+    """Print a table: names on the left, numbers on the right.
 
     A table that is wider than the terminal (80 columns in a pipe) loses groups of `optional` columns, the first
-    group first, and says so. If it is still too wide, the first column gets a line of its own above the others.
+    group first, and says so.
 
     Args:
       columns: headings; "<name" aligns a column to the left, as the first one always is.
@@ -56,27 +56,18 @@ def print_table(
 
     console, heads = Console(highlight=False), [printable(column.removeprefix("<")) for column in columns]
     left = {i for i, column in enumerate(columns) if i == 0 or column.startswith("<")}
-    lines, shown, stacked = [[printable(str(cell)) for cell in row] for row in rows], list(range(len(heads))), False
+    lines, shown = [[printable(str(cell)) for cell in row] for row in rows], list(range(len(heads)))
     widths = [max(len(line[i]) for line in [heads, *lines]) for i in range(len(heads))]
-
-    def width() -> int:
-        cells = [widths[i] for i in shown[stacked:]]
-        return sum(cells) + 2 * (len(cells) - 1) + 2 * stacked
 
     hidden = []
     for names in optional:
-        if width() > console.width:
+        if sum(widths[i] + 2 for i in shown) - 2 > console.width:
             shown = [i for i in shown if heads[i] not in names]
             hidden += [name for name in names if name in heads]
-    stacked = width() > console.width
-
-    def line_of(line: Sequence[str]) -> str:
-        cells = [line[i].ljust(widths[i]) if i in left else line[i].rjust(widths[i]) for i in shown[stacked:]]
-        return ("  " * stacked + "  ".join(cells)).rstrip()
 
     def put(line: Sequence[str], style: str) -> None:
-        for text in ([line[0]] if stacked else []) + [line_of(line)]:
-            console.print(Text(text, style), soft_wrap=True)
+        cells = [line[i].ljust(widths[i]) if i in left else line[i].rjust(widths[i]) for i in shown]
+        console.print(Text("  ".join(cells).rstrip(), style), soft_wrap=True)
 
     if title:
         console.print(Text(printable(title), "bold"), soft_wrap=False)

@@ -37,6 +37,7 @@ def command_of(
     *arguments: str,
     groups: dict[str, tuple[str, ...]] | None = None,
     only: Sequence[str] = (),
+    epilog: str | None = None,
 ) -> Callable:
     """Decorator: a click command with the parameters of a function.
 
@@ -47,6 +48,7 @@ def command_of(
       arguments: parameters that have no flag, by default the first one.
       groups: see `GroupedCommand`.
       only: names of the parameters that the command has, all by default.
+      epilog: text below the options.
     """
 
     def decorate(show: Callable) -> click.Command:
@@ -59,7 +61,8 @@ def command_of(
         json_option(callback)
         parameters = [each for each in parameters_of(function, arguments) if not only or each.name in only]
         callback.__click_params__ += [*own, *reversed(parameters)]
-        return click.command(show.__name__.replace("_", "-"), cls=GroupedCommand, option_groups=groups)(callback)
+        name, options = show.__name__.replace("_", "-"), dict(option_groups=groups, epilog=epilog)
+        return click.command(name, cls=GroupedCommand, **options)(callback)
 
     return decorate
 

@@ -38,13 +38,7 @@ Distractors:
 """
 
 
-def _with_table(command: click.Command) -> click.Command:
-    command.epilog = DISTRACTORS
-    return command
-
-
-@_with_table
-@command_of(making.rollout, groups=OPTION_GROUPS)
+@command_of(making.rollout, groups=OPTION_GROUPS, epilog=DISTRACTORS)
 @click.option("--dry-run", is_flag=True, help="List finished and remaining shards; write nothing.")
 def rollout(dry_run, as_json, progress, workers, other_versions, **options):
     """Roll out behaviour policies into a release of episodes.
@@ -59,13 +53,11 @@ def rollout(dry_run, as_json, progress, workers, other_versions, **options):
         --distractor none --distractor dynamic --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static'
     """
-    from dmcvb_gen.generate.counts import check_room
     from dmcvb_gen.generate.plan import start
 
     plan = _plan(options)
     if dry_run:
         return _show_plan(plan, as_json)
-    check_room(plan)
     start(plan, other_versions)
     _run(plan, workers, as_json)
 
@@ -84,8 +76,7 @@ def cluster():
 WHAT = tuple(name for names in OPTION_GROUPS.values() for name in names)
 
 
-@_with_table
-@command_of(making.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT))
+@command_of(making.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT), epilog=DISTRACTORS)
 def begin(as_json, progress, **options):
     """Create a release without generating any episodes. The options are those of `rollout`."""
     from dmcvb_gen.generate.plan import start
@@ -167,15 +158,8 @@ def _run(plan, workers, as_json, whole=True):
     from dmcvb_gen.generate.plan import run_plan
     from dmcvb_gen.generate.progress import missing_subsets
 
-    finished = 0
-
-    def count(result):
-        nonlocal finished
-        finished += result.episodes
-        bar.set_postfix_str(f"{finished}/{plan.episodes} episodes", refresh=False)
-
     with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
-        made = run_plan(plan, workers, bar, finishing=whole, on_result=count)
+        made = run_plan(plan, workers, bar, finishing=whole)
     release, steps, place = made.release, made.steps, plan.store.place
     complete = whole and not missing_subsets(release)
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import webbrowser
-
 import click
 
 from dmcvb_gen.cli.common import answer
@@ -28,8 +26,7 @@ def preview(as_json, progress, **options):
 
 
 @command_of(write_viewer)
-@click.option("--open", "open_it", is_flag=True, help="Open the file in a browser.")
-def view(open_it, as_json, **options):
+def view(as_json, **options):
     """Write one HTML file that plays episodes: images, reward, actions, states and distractor labels.
 
     The file works without a network. Images that the release does not store are rendered for it.
@@ -42,8 +39,6 @@ def view(open_it, as_json, **options):
     shows = f"{pluralize(written.episodes, 'episodes')} of {pluralize(written.subsets, 'subsets')}"
     left_out = f", one image in {written.stride}" if written.stride > 1 else ""
     answer(as_json, vars(written), f"{written.path}: {shows}{left_out}, {format_bytes(written.bytes)}")
-    if open_it:
-        webbrowser.open(written.path.resolve().as_uri())
 
 
 @command_of(write_card)

@@ -73,14 +73,9 @@ def check_memory(works: Sequence[Work], workers: Workers) -> None:
     needed = _memory(largest) - PROCESS_BYTES
     if needed * side_by_side <= free:
         return
-    record, rows = largest.settings[0].record, largest.trajectories.rows
-    advice = "fewer --workers or a machine with more memory" if side_by_side > 1 else "a machine with more memory"
-    if largest.simulates:
-        advice = f"fewer --episodes-per-shard in a new release, or {advice}"
     raise StoreError(
-        f"a shard of {record.name} ({len(largest.episodes)} episodes of {rows - 1} steps, {record.size} pixels "
-        f"a side) needs {format_bytes(needed)} of memory, {side_by_side} are made at once, and {format_bytes(free)} "
-        f"are free; use {advice}"
+        f"a shard of {largest.settings[0].record.name} needs {format_bytes(needed)} of memory, {side_by_side} are made "
+        f"at once, and {format_bytes(free)} are free; give fewer --workers, or fewer --episodes-per-shard in a new one"
     )
 
 

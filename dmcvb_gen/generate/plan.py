@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from dmcvb_gen.dataset.gate import Release, read_recipes
 from dmcvb_gen.dataset.manifest import COPY
 from dmcvb_gen.dataset.writer import begin, check_agree, check_versions, finish, write_provenance
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.generate.engine import WorkResult
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.recipe import Recipe
 from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
@@ -48,11 +47,6 @@ class Plan:
     def store(self) -> Store:
         """Where the release lies."""
         return self.release.store
-
-    @property
-    def episodes(self) -> int:
-        """Episodes of subsets that lack something."""
-        return sum(episodes_left(self.works).values())
 
     @property
     def unit(self) -> str:
@@ -166,7 +160,6 @@ def run_plan(
     progress: ProgressCallback = ignore,
     *,
     finishing: bool = True,
-    on_result: Callable[[WorkResult], None] = ignore,
 ) -> RolloutResult:
     """Make every shard of a plan, and write the manifest of subsets that are whole.
 
@@ -175,7 +168,6 @@ def run_plan(
       workers: see `run_works`.
       progress: called with the number of frames rendered since the last call.
       finishing: write the manifest; False for a part, because other machines make the rest.
-      on_result: called with the result of each work.
 
     Raises:
       StoreError: the disk is full, or another machine has put other bytes.
@@ -183,6 +175,5 @@ def run_plan(
     started, steps = time.monotonic(), 0
     for result in run_works(plan.works, workers, progress):
         steps += result.steps
-        on_result(result)
     release = finish(plan.store) if finishing else plan.release
     return RolloutResult(release, steps, time.monotonic() - started)

@@ -13,6 +13,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.options import Count, Local, Location, Names, checked
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.text import as_names, quoted
 
 SHEET_COLUMNS = 10
@@ -136,7 +137,7 @@ def write_preview(release: Location, *, only: Names = (), out: Local | None = No
         if names:
             cure = f"add them: dmcvb-gen paint {quoted(release)}, or see it without: dmcvb-gen view {quoted(release)}"
         raise StoreError(f"{release} has no finished episodes with images; {cure}")
-    folder = Path(out or opened.path / "preview")
+    folder = local_path(out) if out else opened.path / "preview"
     sheet, video = folder / "contact_sheet.png", folder / "preview.webp"
     picture = Image.fromarray(contact_sheet(subsets, episodes))
     with storage_errors(folder, "write to"):

@@ -7,7 +7,6 @@ and one call of the renderer.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, SupportsFloat
 
@@ -22,7 +21,7 @@ from numpy.typing import ArrayLike
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
-from dmcvb_gen.errors import BackgroundError, DmcvbError
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look
 from dmcvb_gen.rendering import make_renderer
@@ -30,7 +29,6 @@ from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
     HIDDEN,
-    SPLITS,
     VISIBLE,
     GoalMode,
     SubsetSpec,
@@ -117,6 +115,11 @@ class Scene:
         for name in unused:
             if getattr(self, name) != getattr(Scene, name):
                 raise DmcvbError(f"{name} has no effect on {self.task} {self.distractor}; remove {name}")
+        if self.own_videos and self.backgrounds == "builtin":
+            raise DmcvbError(
+                f"the data show videos of their own (digest {self.own_videos[:12]}), not the built-in ones: give their "
+                "folder with backgrounds=FOLDER"
+            )
         if self.views is not None and not len(self.views):
             raise DmcvbError("views is empty; leave it out for all of them")
         for modality in as_names(self.modalities):
@@ -124,25 +127,6 @@ class Scene:
                 raise DmcvbError(
                     f"an environment has no {modality}: the next frame is not known yet; remove {modality}"
                 )
-        if self.own_videos:
-            self._check_videos(self.own_videos)
-
-    def _check_videos(self, wanted: str) -> None:
-        """Raises DmcvbError for other videos than those of the data, if they can be compared."""
-        if self.backgrounds == "builtin":
-            raise DmcvbError(
-                f"the data show videos of their own (digest {wanted[:12]}), not the built-in ones: give their folder "
-                "with backgrounds=FOLDER"
-            )
-        found = {}
-        for split in SPLITS:
-            with contextlib.suppress(BackgroundError):  # a folder may hold the videos of evaluation alone
-                found[split] = load_backgrounds(self.backgrounds, split).digest
-        if "train" in found and wanted not in found.values():
-            raise DmcvbError(
-                f"{self.backgrounds} does not hold the videos of the data (digest {wanted[:12]}); give their folder "
-                "with backgrounds=FOLDER"
-            )
 
 
 def _scene(task: str, distractor: str, options: Mapping[str, Any]) -> Scene:
@@ -281,15 +265,9 @@ class _Stage:
 
     def _checked(self, actions: ArrayLike, active: np.ndarray) -> np.ndarray:
         """(place, action) float64."""
-        wanted = (self.count, self.task.action_size)
-        try:
-            actions = np.asarray(actions, np.float64)
-        except (TypeError, ValueError):
-            raise DmcvbError(f"the actions are no numbers; give an array of shape {wanted}") from None
+        actions, wanted = np.asarray(actions, np.float64), (self.count, self.task.action_size)
         if actions.shape != wanted:
-            alone = self.count == 1 and actions.shape[:1] == (1,)  # as it was given to an environment of one place
-            given, expected = (actions.shape[1:], wanted[1:]) if alone else (actions.shape, wanted)
-            raise DmcvbError(f"the action has shape {given}; {self.task.id} takes shape {expected}")
+            raise DmcvbError(f"the actions have shape {actions.shape}; {self.task.id} takes shape {wanted}")
         if not np.isfinite(actions[active]).all():
             raise DmcvbError("the action holds NaN or infinite values; give finite numbers in action_space")
         return actions

@@ -11,7 +11,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -145,20 +144,6 @@ class PaintedSubset(SubsetReader):
             values[:rows] = getattr(self._fresh_labels(episode), label)[:rows]
         return values
 
-    def rows(self, arrays: Iterable[str], episodes: Iterable[int]) -> dict[str, np.ndarray]:
-        """See `Subset.rows`; all pictures of an episode are painted at once."""
-        names, chosen = tuple(arrays), self.choose(episodes)
-        pictures = [name for name in names if picture_of(name) is not None]
-        if not pictures or not len(chosen):
-            return super().rows(names, chosen)
-        counts = self.read("length", chosen) + 1
-        self.prepare(chosen, pictures)
-        painted = [self.painted(int(episode), pictures) for episode in chosen]
-        values = super().rows([name for name in names if name not in pictures], chosen)
-        for name in pictures:
-            values[name] = np.concatenate([p[name][:count] for p, count in zip(painted, counts, strict=True)])
-        return values
-
     def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
         """Draw fresh distractors of episodes together, as far as their pictures are not kept and there is room."""
         with self._lock:
@@ -256,18 +241,6 @@ class PaintedRelease(ReleaseReader):
         stored = SubsetReader(self, record)
         whole = self.missing and not stored.unpainted.any()
         return stored if record.imported or whole else PaintedSubset(self, record, self.painting)
-
-
-def open_painted(
-    path: str | Path, storage_options: dict | None = None, digest: str | None = None, **painting: Any
-) -> ReleaseReader:
-    """A release whose pictures are painted when they are read; see `dmcvb_gen.open` and `Painting`.
-
-    Raises:
-      StoreError: there is no release, it cannot be read, or it was imported.
-      TypeError: `painting` has an unknown field.
-    """
-    return painted_release(Release.open(path, storage_options, digest), Painting(**painting))
 
 
 def painted_release(release: Release, painting: Painting, missing: bool = False) -> ReleaseReader:

@@ -1,10 +1,6 @@
 """Progress: a bar on a terminal and rare lines in a log, that know how much is to come; for both families."""
 
-import contextlib
-import os
 import re
-import subprocess
-import sys
 
 import pytest
 from click.testing import CliRunner
@@ -108,22 +104,3 @@ def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
     assert frames == expected[-1] == views * (subset.steps + 3) < expected[0] == views * 3 * 601
     first = subset.read("length", [0])[0] + 1
     assert expected[1] == pytest.approx(3 * views * first, abs=3)
-
-
-@pytest.mark.slow
-def test_a_terminal_gets_a_bar(small_release):
-    import pty
-    import termios
-
-    master, slave = pty.openpty()
-    termios.tcsetwinsize(slave, (24, 100))
-    command = [sys.executable, "-m", "dmcvb_gen", "verify", str(small_release)]
-    with subprocess.Popen(command, stderr=slave, stdout=subprocess.DEVNULL) as process:
-        os.close(slave)
-        shown = b""
-        with contextlib.suppress(OSError):  # Linux's end of a terminal; elsewhere it is an empty read
-            while part := os.read(master, 4096):
-                shown += part
-    os.close(master)
-    states = shown.decode().split("\r")
-    assert process.returncode == 0 and len(states) > 2 and "100%" in states[-2] and "checks" in states[-2]

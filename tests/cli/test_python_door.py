@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
-import json
-import re
 
 import click
 import numpy as np
 import pytest
 
 import dmcvb_gen
-from dmcvb_gen.benchmarks.validate import make_budget
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.errors import DmcvbError
 
 FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "fetch", "export", "validate")
 FUNCTIONS += ("train_behaviour", "evaluate_behaviour")
-FAMILIES = {
-    "locomotion": dict(tasks="walker-walk", distractors=["none", "dynamic"]),
-    "suite": dict(tasks="cartpole-swingup", levels="random", distractors="static"),
-    "maze": dict(tasks="ant-maze-empty7x7", goals="visible"),
-}
-TINY = dict(episodes=2, max_steps=8, size=32, episodes_per_shard=1, progress=False)
 COMMANDS_ALONE = {"as_json", "dry_run", "strict", "own", "list_settings"}
 """Options that say how something is printed, only print, begin and end a release of many machines, or belong to another
 one."""
-
-
-@pytest.fixture(scope="module", params=FAMILIES)
-def family(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("door")
-    return folder, dmcvb_gen.rollout(out=folder / "r", **FAMILIES[request.param], **TINY)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -55,45 +38,6 @@ def test_a_command_has_the_options_of_its_function(name):
         assert parsed[option.name] == default or not (parsed[option.name] or default), option.name
 
 
-def test_the_help_of_rollout_states_the_defaults_of_recipes():
-    """They are those of `Recipe` and `SubsetPattern`, which other arguments of `rollout` override."""
-    from dmcvb_gen.generate.recipe import NATIVE, Recipe, SubsetPattern
-    from dmcvb_gen.generate.request import EPISODES
-
-    fields = Recipe.model_fields | SubsetPattern.model_fields
-    stated = {
-        option.name: found[1]
-        for option in main.get_command(None, "rollout").params
-        if (found := re.search(r"\[default: ([^];]*)", getattr(option, "help", "") or ""))
-    }
-    for name in ("seed", "size", "backgrounds", "split"):
-        assert stated[name] == str(fields[name].default)
-    assert stated["renderer"] == NATIVE and stated["episodes"] == str(EPISODES)
-
-
-@pytest.mark.slow_cases("locomotion", "maze", "suite")
-def test_a_whole_release_goes_through_python(family):
-    folder, release = family
-    assert not release.shortfalls
-    assert dmcvb_gen.verify(folder / "r", progress=False).sound
-    assert dmcvb_gen.validate(folder / "r", checks_only=True, out=folder / "report", progress=False).sound
-    assert dmcvb_gen.regenerate(folder / "r", check=True, progress=False).sound
-    url = f"file:{folder / 'published'}"
-    assert dmcvb_gen.publish(folder / "r", url, pixels=False, progress=False).moved > 0
-    light = dmcvb_gen.fetch(url, folder / "light", progress=False)
-    assert light.digest is not None
-    painted = dmcvb_gen.paint(folder / "light", progress=False)
-    assert painted.known == painted.shards > 0 and not painted.differing
-    name = next(iter(release))
-    one, other = release[name].episode(0), dmcvb_gen.open(str(folder / "light"))[name].episode(0)
-    for key in one:
-        np.testing.assert_array_equal(np.asarray(one[key]), np.asarray(other[key]))
-    larger = dmcvb_gen.repaint(folder / "r", out=folder / "large", size=24, progress=False)
-    assert {subset.size for subset in larger.manifest.subsets} == {24}
-    [*folders] = dmcvb_gen.export(folder / "r", "hdf5", folder / "h5", progress=False)
-    assert len(folders) == len(release.manifest.subsets) and all(path.is_dir() for path in folders)
-
-
 def test_the_command_line_makes_the_same_bytes(tmp_path):
     from click.testing import CliRunner
 
@@ -103,22 +47,6 @@ def test_the_command_line_makes_the_same_bytes(tmp_path):
     made = dmcvb_gen.rollout("walker-walk", out=tmp_path / "python", **given)
     assert made.digest == Release.open(tmp_path / "cli").digest
     assert dmcvb_gen.rollout(out=tmp_path / "python", progress=False).digest == made.digest
-
-
-def test_every_file_and_folder_may_be_a_path(tmp_path, monkeypatch):
-    """Runs and reports are written as JSON, which has no paths."""
-    budget = make_budget(backgrounds=tmp_path / "videos", dino_weights=tmp_path / "weights")
-    json.dumps(dataclasses.asdict(budget))
-    begun = []
-
-    def stop(_, config, __):
-        begun.append(json.dumps(dataclasses.asdict(config)))
-        raise DmcvbError("enough")
-
-    monkeypatch.setattr("dmcvb_gen.training.run.open_run", stop)
-    with pytest.raises(DmcvbError, match="enough"):
-        dmcvb_gen.train_behaviour("walker-walk", out=tmp_path / "run", init_from=tmp_path / "other", progress=False)
-    assert str(tmp_path / "other") in begun[0]
 
 
 def test_arguments_may_be_paths_numpys_numbers_and_iterators(tmp_path):

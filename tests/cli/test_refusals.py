@@ -89,7 +89,7 @@ OTHERS = [
     ("fetch r --out mine --option a=b", "r is a folder"),
     ("fetch file:x --out s3://bucket/demo", "s3://bucket/demo is a URL; give a local one, a folder or file"),
     ("export r --to hdf5 --out mine --option a=b", "r is a folder"),
-    ("paint s3://bucket/demo", "dmcvb-gen fetch s3://bucket/demo --paint --out FOLDER"),
+    ("paint s3://bucket/demo", "s3://bucket/demo is a URL; give a local one"),
     ("paint r --size 2000", "8 to 1024"),
     ("paint r --views nowhere", "unknown view"),
     ("paint r --only cheetah-run", "walker-walk/random/none"),

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import click
 import pytest
 from click.testing import CliRunner
 
 from dmcvb_gen.cli import COMMANDS, main
-from dmcvb_gen.cli.common import GroupedCommand, print_table
 
 PARTS = ("begin", "part", "finish", "slurm")
 
@@ -49,12 +47,6 @@ def test_a_wide_terminal_shows_every_column(small_release):
     assert all(name in text for name in ("B/step", "p25", "median", "p75")) and "not shown" not in text
 
 
-def test_a_table_that_fits_nowhere_gives_its_names_a_line_of_their_own(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "30")
-    print_table(("subset", "steps", "bytes"), [("a-very-long-name/of/a/subset", "1,000,000", "20.0 GB")])
-    assert capsys.readouterr().out.splitlines()[2:] == ["a-very-long-name/of/a/subset", "  1,000,000  20.0 GB"]
-
-
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), *(["cluster", name] for name in PARTS)])
 def test_help_fits_80_columns_and_has_an_example(command):
     lines = screen([*command, "--help"])
@@ -63,14 +55,3 @@ def test_help_fits_80_columns_and_has_an_example(command):
         assert all(f"  {name} " in "\n".join(lines) for name in COMMANDS)
     if len(command) == 1 and command != ["list"]:
         assert any(line.strip().startswith(f"dmcvb-gen {command[0]}") for line in lines)
-
-
-def test_the_options_of_rollout_have_headings():
-    command = main.get_command(click.Context(main), "rollout")
-    assert isinstance(command, GroupedCommand)
-    named = [name for names in command.option_groups.values() for name in names]
-    assert len(named) == len(set(named))
-    others = {"workers", "other_versions", "dry_run", "as_json"}
-    assert {p.name for p in command.params if isinstance(p, click.Option)} == {*named, *others}
-    lines = screen(["rollout", "--help"])
-    assert all(f"{heading}:" in lines for heading in command.option_groups)

@@ -4,14 +4,10 @@ import pytest
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import expand, load_recipe, shipped_recipes
-from dmcvb_gen.policies import bundled
 from dmcvb_gen.policies.bundled import bundled_levels
-from dmcvb_gen.policies.header import PolicyHeader, weight_shapes
-from dmcvb_gen.policies.policy_file import save_policy
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.spec import DistractorSetting
-from dmcvb_gen.tasks import get_task
 from tests.conftest import invoke
 
 TINY = ["--episodes", "2", "--max-steps", "3", "--size", "8"]
@@ -78,18 +74,3 @@ def test_two_episodes_of_every_subset_of_a_shipped_recipe_are_planned_made_and_s
     card = (tmp_path / "r" / "README.md").read_text()
     assert name not in PUBLISHED or "Not equal to theirs:" in card
     assert ("60 background videos are asked for, and 8 are there" in card) == (name == "laom")
-
-
-def test_tasks_without_a_bundled_expert_name_the_cure_and_take_an_expert_of_ones_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(bundled, "bundled_names", lambda task, level: [])
-    cut = ["--recipe", "laom", "hopper-hop", *TINY, "--out", tmp_path / "r"]
-    refused = run(*cut, "--dry-run")
-    assert refused.exit_code and "train-behaviour hopper-hop" in refused.output and "--behaviour" in refused.output
-    task = get_task("hopper-hop")
-    sizes = {"observation_size": task.behaviour_size, "action_size": task.action_size}
-    header = PolicyHeader(task="hopper-hop", algorithm="sac", agent_step=0, hidden=(4,), **sizes)
-    weights = {weight: [[0.5] * shape[-1]] * shape[0] if shape[1:] else [0.5] * shape[0]
-               for weight, shape in weight_shapes(header).items()}  # fmt: skip
-    save_policy(tmp_path / "expert.safetensors", header, weights)
-    made = run(*cut, "--behaviour", tmp_path / "expert.safetensors", "--workers", 1)
-    assert made.exit_code == 0 and not verify(tmp_path / "r").findings, made.output

@@ -17,7 +17,7 @@ from dmcvb_gen.policies import simulate
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
-from tests.conftest import invoke, records, rewrite, roll_out, small_recipe
+from tests.conftest import records, rewrite, roll_out, small_recipe
 
 
 @pytest.fixture
@@ -100,21 +100,6 @@ def test_labels_of_hidden_goals_do_not_show_them(small_mazes, tmp_path):
         goal = get_task(subset.task).goal_geoms
         seen[name.rsplit("/")[-1]] = any(np.isin(subset.read(array, [0]), goal).any() for array in arrays)
     assert seen == {"visible": True, "hidden": False, "fixed": False}
-
-
-def test_modalities_have_the_views_of_the_task(tmp_path):
-    asked = ["--level=random", "--goal=visible", "--episodes=2", "--max-steps=3", "--size=16", "--no-pixels"]
-    for command in (
-        ["rollout", "ant-maze-empty7x7", *asked, "--out", str(tmp_path / "few views")],
-        ["paint", str(tmp_path / "few views"), "--views", "egocentric,top"],
-        ["repaint", str(tmp_path / "few views"), "--label", "depth", "--out", str(tmp_path / "new labels")],
-    ):
-        result = invoke(*command, code=0)
-    assert f"dmcvb-gen preview '{tmp_path / 'new labels'}'" in result.output
-    [subset] = Release.open(tmp_path / "new labels").subsets.values()
-    depth = {name for name in subset.arrays if name.startswith("depth")}
-    assert depth == {f"depth/{view}" for view in subset.record.views} and verify(tmp_path / "new labels").sound
-    assert all(subset.read(name).any() for name in depth)
 
 
 def test_an_interrupted_repaint_goes_on(small_release, dynamic, tmp_path, no_simulation):

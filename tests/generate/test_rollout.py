@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RecipeError, RenderingError, StoreError, UnknownNameError
-from dmcvb_gen.generate.counts import LEAST_SHARE, check_room, count
+from dmcvb_gen.generate.counts import count
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, start
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
@@ -30,7 +29,7 @@ from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.spec import LEVELS, is_maze
 from dmcvb_gen.tasks import get_task
-from tests.conftest import TINY_MAZE, invoke, maze_recipe, records, roll_out, short_recipe, small_recipe
+from tests.conftest import invoke, maze_recipe, records, roll_out, short_recipe, small_recipe
 from tests.faults.commands import GRACE, session
 
 NAME = "walker-walk/random/dynamic"
@@ -177,25 +176,6 @@ def test_a_full_disk_is_said_and_costs_nothing_that_is_there(small_release, tmp_
         signal.signal(signal.SIGXFSZ, handler)
     assert not pixels.exists() and not make_plan(small_recipe(), copy).works[0].simulates
     assert roll_out(small_recipe(), copy).digest == Release.open(small_release).digest
-
-
-@pytest.mark.parametrize(("family", "frame"), [("walker", 16 * 16 * 3), ("mazes", 4 * 2 * 16 * 16 * 3)])
-def test_a_disk_that_cannot_hold_the_release_is_refused_before_any_work(tmp_path, monkeypatch, family, frame):
-    """60 steps, so 61 frames; four views of mazes, with the goal and without it."""
-    task, setting = {"walker": ("walker-walk", "dynamic"), "mazes": (TINY_MAZE, "visible")}[family]
-    subsets = [{"tasks": task, "levels": "random", "settings": setting, "episodes": 3, "max_steps": 60}]
-    plan = make_plan(small_recipe(subsets=subsets), tmp_path / "r")
-    images = 3 * 61 * frame
-
-    def free(amount):
-        monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=amount))
-
-    free(LEAST_SHARE * images)
-    with pytest.raises(StoreError, match=r"^at least .*B are needed and .*B are free at .*; make room"):
-        check_room(plan)
-    assert not (tmp_path / "r").exists()
-    free(LEAST_SHARE * images * 4)
-    check_room(plan)
 
 
 def test_counts_are_those_of_the_release_that_is_made(small_release, tmp_path):

@@ -89,12 +89,6 @@ def test_stored_modalities_are_read_with_their_own_pictures_alone(made, tmp_path
             subset.array(depths[0])
 
 
-def test_painted_pictures_of_no_episodes_are_an_empty_array(small_release):
-    subset = next(iter(dmcvb_gen.open(str(small_release), paint=True).subsets.values()))
-    assert subset.array("pixels")[0:0].shape == (0, *subset.array("pixels").shape[1:])
-    assert subset.read("pixels", []).shape == subset.array("pixels")[0:0].shape
-
-
 def test_fresh_distractors_are_the_same_alone_and_drawn_together(made, monkeypatch):
     opened = [dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample") for _ in range(2)]
     together, alone = map(distracted, opened)
