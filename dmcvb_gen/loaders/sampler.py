@@ -168,40 +168,20 @@ def stream(
         own = np.random.default_rng([seed, epoch, 0]).permutation(own)
     own = own[worker::workers]
     mixer = np.random.default_rng([seed, epoch, 1 + worker]) if shuffle else None
-    tables = (
-        StepTable.read([Selection(subset, own[first : first + buffer], names)]) for first in range(0, len(own), buffer)
-    )
-    parts = (
-        (table.gather(rows, stack, next_step), len(rows)) for table, rows in _drawn(tables, mixer, batch_size or 1)
-    )
-    for batch in _joined(parts, batch_size or 1, drop_last):
-        yield batch if batch_size else {name: value[0] for name, value in batch.items()}
-
-
-def _drawn(
-    tables: Iterator[StepTable], mixer: np.random.Generator | None, size: int
-) -> Iterator[tuple[StepTable, np.ndarray]]:
-    """Rows of one table after the other, mixed if there is a mixer, cut so that every `size` of them end a part."""
-    held = 0
-    for table in tables:
+    size, count = batch_size or 1, 0
+    held: list[Steps] = []  # parts of a batch that is not full yet, with `count` steps
+    for first in range(0, len(own), buffer):
+        table = StepTable.read([Selection(subset, own[first : first + buffer], names)])
         rows = table.steps if mixer is None else mixer.permutation(table.steps)
-        for part in np.split(rows, range(size - held, len(rows), size)):
-            yield table, part
-        held = (held + len(rows)) % size
-
-
-def _joined(parts: Iterator[tuple[Steps, int]], size: int, drop_last: bool) -> Iterator[Steps]:
-    """Parts joined to batches of `size` steps; the last one may have fewer."""
-    held: list[Steps] = []
-    count = 0
-    for part, steps in parts:
-        held, count = [*held, part], count + steps
-        if count == size:
-            yield _concatenated(held)
-            held, count = [], 0
+        for part in np.split(rows, range(size - count, len(rows), size)):
+            held, count = [*held, table.gather(part, stack, next_step)], count + len(part)
+            if count == size:
+                batch = _joined(held)
+                yield batch if batch_size else {name: value[0] for name, value in batch.items()}
+                held, count = [], 0
     if count and not drop_last:
-        yield _concatenated(held)
+        yield _joined(held)
 
 
-def _concatenated(parts: Sequence[Steps]) -> Steps:
+def _joined(parts: Sequence[Steps]) -> Steps:
     return parts[0] if len(parts) == 1 else {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
