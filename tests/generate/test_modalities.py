@@ -8,8 +8,6 @@ import imageio.v3 as iio
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import dmcvb_gen
 from dmcvb_gen.dataset.gate import Release
@@ -72,13 +70,13 @@ def check_lerobot(folder, file, flow):
         assert found.shape[1:3] == (16, 16) and list(found.shape[3:]) == [3] * (kind.levels is None)
 
 
-@given(geoms=st.sets(st.integers(-1, 2**15 - 1), min_size=2), numbers=st.lists(st.floats(-15, 15), min_size=2))
-def test_images_hold_the_values_as_their_encodings_say(geoms, numbers):
+def test_images_hold_the_values_as_their_encodings_say():
     geom_of, depth_of, flow_of = map(get_modality, ("segmentation", "depth", "flow"))
-    segmentation = np.array(sorted(geoms), np.int16)[:, None]
-    assert len(np.unique(geom_of.color(segmentation), axis=0)) == len(geoms)  # no two geoms have one color
+    segmentation = np.arange(-1, 2**15 - 1, dtype=np.int16)[:, None]
+    codes = geom_of.color(segmentation).astype(int) @ [65536, 256, 1]
+    assert len(np.unique(codes)) == len(segmentation)  # no two geoms have one color
     np.testing.assert_array_equal(geom_of.gray(segmentation).astype(int) - 1, segmentation)
-    flow = np.float32(numbers)[:, None, None].repeat(2, axis=-1)
+    flow = np.linspace(-15, 15, 999, dtype=np.float32)[:, None, None].repeat(2, axis=-1)
     assert np.abs((flow_of.color(flow)[..., :2].astype(float) - 128) * STEP - flow).max() <= STEP / 2
     depth = np.abs(flow[..., 0])
     assert np.abs(depth_of.gray(depth) / 1000 - depth).max() <= 0.5001e-3

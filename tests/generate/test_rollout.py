@@ -211,7 +211,7 @@ NONSENSE = [
     ({"colour": "red"}, RecipeError, "colour"),
     ({"action_repeat": 3}, RecipeError, "action_repeat: Input should be 1, 2 or 4"),
     ({"renderer": {"backend": "povray"}}, UnknownNameError, "native"),
-    ({"backgrounds": "/nowhere"}, DmcvbError, "does not exist"),
+    ({"backgrounds": "/nowhere"}, DmcvbError, "give a folder of videos"),
     ({"subsets": []}, RecipeError, "subsets"),
     ({"subsets": [{"task": "walker-walk"}]}, RecipeError, "unknown field 'task'.*'tasks'"),
     ({"renderer": {"backend": "native", "sample": 2}}, RecipeError, "unknown field 'sample'. Did you mean 'samples'"),
