@@ -216,6 +216,12 @@ def remove_partial(folder: str | Path) -> None:
                 path.unlink(missing_ok=True)
 
 
+def free_bytes(folder: str | Path) -> int:
+    """Bytes that are free on the disk where a folder is, or would be."""
+    path = Path(folder).absolute()
+    return shutil.disk_usage(next(place for place in (path, *path.parents) if place.exists())).free
+
+
 def sha256_file(path: str | Path) -> str:
     """SHA-256 of a file's bytes, in hex."""
     with Path(path).open("rb") as file:
