@@ -315,8 +315,6 @@ class EpisodeBatch(abc.ABC):
           (size, state) float64, the states of all simulations.
         """
         ids = self._all if ids is None else np.asarray(ids, int)
-        if len(generators) != len(ids):
-            raise ValueError(f"{len(ids)} simulations to reset, {len(generators)} generators given")
         if len(ids):
             self._start(ids, generators)
         return self.state()
