@@ -85,15 +85,11 @@ def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     """All columns except the pictures."""
     policies = [policy.name for policy in subset.record.policies] or ["random"]
     values = {name: subset.read(name, episodes) for name in ("return", "length", "terminated")}
-    seeds: Any
-    if subset.record.imported:
-        seeds, behaviour = [None] * len(episodes), np.full(len(episodes), -1)
-    else:
-        seeds, behaviour = subset.read("seed", episodes), subset.read("behaviour", episodes)
+    behaviour = subset.read("behaviour", episodes)
     return values | {
         "subset": [subset.name] * len(episodes),
         "episode": np.asarray(episodes, np.int64),
-        "seed": seeds,
+        "seed": [None] * len(episodes) if subset.record.imported else subset.read("seed", episodes),
         "policy": [policies[index] if 0 <= index < len(policies) else "unknown" for index in behaviour],
     }
 

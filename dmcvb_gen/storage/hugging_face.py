@@ -150,7 +150,7 @@ class HubStore(Store):
 
         if path in self._known([path], self._head()):
             gone = [CommitOperationDelete(self.folder_there + path)]
-            self._made(self._api.create_commit(**self._where, operations=gone, commit_message=f"remove damaged {path}"))
+            self._made(self._api.create_commit(**self._where, operations=gone, commit_message=f"remove {path}"))
 
     def finish(self, contents: Mapping[str, bytes], expected: str | None = ANY) -> bool:
         """In one commit, which the Hub refuses if another one has come since the version was compared."""
