@@ -184,10 +184,12 @@ class TrainingData:
       start, end: (row,) long, first and last row of the row's episode.
       normalization: normalization of the states, from the training episodes.
       train_rows, hold_out_rows: (n,) long, rows that hold a transition.
+      episode: (row,) long, index of the row's episode in its subset.
       latent: (row, latent) float32 of a frozen encoder (`encoded`); None elsewhere.
     """
 
     latent: torch.Tensor | None = None
+    labeled_rows: torch.Tensor
 
     def __init__(
         self,
@@ -203,6 +205,7 @@ class TrainingData:
         self.action, self.reward, self.discount = (value.float() for value in values)
         held = torch.from_numpy(out).to(device)
         self.train_rows, self.hold_out_rows = rows[~held[rows]], rows[held[rows]]
+        self.episode = torch.from_numpy(table.episode).to(device)
         self.normalization = Normalization.of(state[~held])
         self.state = self.normalization(state.float())
         self.frames = None if table.frames is None else FrameTable(table.frames, device)
@@ -339,6 +342,17 @@ class TrainingData:
     def states_only(self) -> TrainingData:
         """The same episodes for an agent that sees states: shares everything but the pictures."""
         return self._with(frames=None)
+
+    def with_labels(self, episodes: np.ndarray) -> TrainingData:
+        """The same episodes, of which some are labeled: tests are of others."""
+        labeled = torch.isin(self.episode, self._to_device(episodes))
+        rows = torch.cat([self.train_rows, self.hold_out_rows])
+        tests = self.hold_out_rows[~labeled[self.hold_out_rows]]
+        return self._with(labeled_rows=rows[labeled[rows]], hold_out_rows=tests)
+
+    def labeled(self) -> TrainingData:
+        """The labeled episodes of `with_labels`, to learn from."""
+        return self._with(train_rows=self.labeled_rows)
 
     def with_stack(self, stack: int) -> TrainingData:
         """The same episodes seen in stacks of another number of frames."""

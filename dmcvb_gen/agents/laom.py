@@ -3,8 +3,8 @@ in the presence of distractors", section 4; arXiv 2502.00379).
 
 LAPO with four changes: the inverse model sees an observation several steps later; its latent action is not replaced by
 codes; the forward model predicts what a slow average of the encoder sees, and no image; observations are augmented.
-"laom+bc" decodes the latent actions by all labeled trajectories that it is given. The paper's supervised variant, whose
-latent actions learn from labels, too, is not this one.
+"laom+bc" decodes the latent actions by all labeled trajectories that it is given. In "laom-labels+bc", the paper's
+supervised variant, the latent actions themselves learn from those labels, too.
 
 What differs from the paper: the networks are those of DMC-VB's agents, so a latent action has 64 numbers (256 in
 `quick`) instead of 8,192; the augmentation is DMC-VB's random shift, as far as the budget shifts; all of it is trained
@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from dmcvb_gen.agents.data import Sizes
 from dmcvb_gen.agents.learners import Batch, Learner, frozen_copy, move_towards, register_agent
-from dmcvb_gen.agents.networks import MLP, PAPER, Architecture, Encoder, observation_encoder
+from dmcvb_gen.agents.networks import MLP, PAPER, Architecture, Encoder, initialize, observation_encoder
 
 
 @register_agent("laom")
@@ -57,3 +58,21 @@ class LatentActionObservationModel(Learner):
         losses = super().update(batch)
         move_towards(self.target, self.see, self.decay)
         return losses
+
+
+@register_agent("laom-labels")
+class SupervisedLatentActionObservationModel(LatentActionObservationModel):
+    """LAOM + || a - h(z) ||^2 on labeled transitions, h linear."""
+
+    needs_labels = True
+
+    def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
+        super().__init__(encoder, sizes, architecture)
+        self.h = initialize(nn.Linear(encoder.features, sizes.action))
+
+    def losses(self, batch):
+        losses = super().losses(batch)
+        if batch.labeled is None:  # of held-out episodes
+            return losses
+        labels = F.mse_loss(self.h(self.latent_action(batch.labeled)).float(), batch.labeled.action)
+        return losses | {"loss": losses["loss"] + labels, "labels": labels}

@@ -40,6 +40,7 @@ class Batch:
       reward, discount: (batch,) of the action at t; discount 0 if the task ended the episode.
       k: (batch,) long, how many steps lie between the two observations.
       latent, next_latent: (batch, latent) of a frozen encoder, of data that are encoded once; None elsewhere.
+      labeled: transitions whose actions may be learned from (`Learner.needs_labels`); None elsewhere.
     """
 
     observation: torch.Tensor | None
@@ -52,6 +53,7 @@ class Batch:
     k: torch.Tensor | None = None
     latent: torch.Tensor | None = None
     next_latent: torch.Tensor | None = None
+    labeled: Batch | None = None
 
 
 def adam(modules: Iterable[nn.Module], lr: float = LEARNING_RATE) -> torch.optim.Adam:
@@ -91,6 +93,8 @@ class Learner(nn.Module, abc.ABC):
     """Whether they need `later_observation`, too."""
     needs_pictures = True
     """Whether batches need observations even if they hold the latents of a frozen encoder."""
+    needs_labels = False
+    """Whether they need `labeled`: it pre-trains an encoder with the actions of the policy's episodes alone."""
     k_max, sample_k = 1, False
     """How far off the next observation is."""
     compiled = ("losses",)

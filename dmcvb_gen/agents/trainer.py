@@ -120,7 +120,8 @@ def draw(
 ) -> Batch:
     """The batch of a step, as the learner needs it; over a batch that is no longer needed, if one is given."""
     generator = np.random.default_rng((seed, step, int(hold_out)))
-    return data.batch(
+    common: dict[str, Any] = dict(shift=shift, dtype=torch.bfloat16 if learner.half else torch.float32)
+    batch = data.batch(
         size,
         generator,
         next_observation=learner.needs_next,
@@ -128,11 +129,13 @@ def draw(
         sample_k=learner.sample_k,
         later=learner.needs_later,
         hold_out=hold_out,
-        shift=shift,
-        dtype=torch.bfloat16 if learner.half else torch.float32,
         reuse=reuse,
         pictures=learner.needs_pictures,
+        **common,
     )
+    if not learner.needs_labels or hold_out:
+        return batch
+    return replace(batch, labeled=data.labeled().batch(size, generator, next_observation=True, **common))
 
 
 def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) -> dict[str, float]:

@@ -31,7 +31,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
-from dmcvb_gen.agents.data import TrainingData, default_memory, load_data
+from dmcvb_gen.agents.data import TrainingData, choose_episodes, default_memory, load_data
 from dmcvb_gen.agents.learners import Learner, Policy
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.probe import action_probe
@@ -213,6 +213,8 @@ class CellRun:
         """Train an encoder and keep it."""
         budget, agent = self.budget, self.cell.agent
         data = self.data(stack=agent.stack)
+        for labels in self.cell.pretrain:
+            data = data.with_labels(choose_episodes(self.release[labels.subset], labels, budget.seed)[0])
         torch.manual_seed(budget.seed)
         encoder = make_encoder(agent, data.sizes, architecture=budget.network)
         learner = make_pretrainer(agent, encoder, data.sizes, budget.network).to(budget.device)

@@ -18,6 +18,7 @@ import numpy as np
 
 from dmcvb_gen.agents.catalog import Agent, parse_agent
 from dmcvb_gen.agents.data import Slice, part_count
+from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.dataset import Release, Subset
@@ -120,8 +121,8 @@ class Cell:
 
     Attributes:
       benchmark: its name; `ENCODER` for an encoder alone, which several cells share.
-      policy: slices that the policy learns from; it is evaluated in the task and setting of the first.
-      pretrain: slices that the encoder learns from; the policy's, if empty.
+      policy: slices that the policy (of an encoder alone: it) learns from; evaluation is in the first one's setting.
+      pretrain: slices that the encoder learns from, the policy's, if empty; of an encoder alone: the labeled ones.
     """
 
     benchmark: str
@@ -172,7 +173,8 @@ class Cell:
         if self.benchmark == ENCODER or self.agent.pretrain is None or self.agent.ready_encoder:
             return None
         parts = self.pretrain or self.policy
-        return Cell(ENCODER, self.task, parts[0].subset.split("/")[-1], self.agent.pretraining, parts)
+        labels = self.policy if PARTS.get(self.agent.pretrain).needs_labels else ()
+        return Cell(ENCODER, self.task, parts[0].subset.split("/")[-1], self.agent.pretraining, parts, labels)
 
     def facts(self) -> dict[str, Any]:
         """Everything that decides the cell, as plain values."""
@@ -523,7 +525,7 @@ class LabelBudgets(Benchmark):
     """
 
     title = "B4: label budgets, latent actions from all images and few labeled episodes"
-    agents = ("lapo+bc", "laom+bc")
+    agents = ("lapo+bc", "laom+bc", "laom-labels+bc")
     compares_encoders = True
     budgets = (2, 8, 32, 128)
 

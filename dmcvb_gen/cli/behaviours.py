@@ -217,13 +217,12 @@ def _show_returns(rows, episodes, seed):
     mazes = any("success" in row for row in rows)
     mode = next((row["mode"] for row in rows if row["level"] != "random"), "random")  # random actions have no mean
     statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
-    scores = ("success", "to goal m/s", "rms m/s") if mazes else ()
+    scores = ("success", "to goal m/s") if mazes else ()
     lines = []
     for row in rows:
         extra = [""] * len(scores)
         if "success" in row:
-            speed = "-" if row["speed"] is None else f"{row['speed']:.2f}"
-            extra = [f"{row['success']:.0%}", speed, f"{row['running_speed']:.2f}"]
+            extra = [f"{row['success']:.0%}", "-" if row["speed"] is None else f"{row['speed']:.2f}"]
         level = row["behaviour"] or row["level"]
         lines.append((row["task"], level, *(f"{row['returns'][key]:.1f}" for key in statistics), *extra))
         if row["paper"]:
@@ -233,5 +232,5 @@ def _show_returns(rows, episodes, seed):
         ("task", "<level", *statistics, *scores),
         lines,
         title=f"{episodes} episodes each, seed {seed}" + ("" if mode == "own" else f", {mode} actions"),
-        optional=(("p25", "p75"), ("rms m/s",), ("min", "max"), ("to goal m/s",)),
+        optional=(("p25", "p75"), ("min", "max"), ("to goal m/s",)),
     )

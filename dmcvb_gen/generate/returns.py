@@ -35,7 +35,7 @@ def evaluate_behaviour(
     Returns:
       A row for each task and level: task, level, episodes, seed, mode ("mean", "sampled", or "own" if a function of
       your own acts), behaviour (that function's name or None), returns (statistics), paper (the same or None); of mazes
-      success, speed and running_speed (m/s) too.
+      success and speed (m/s) too.
 
     Raises:
       DmcvbError: an unknown name, or a policy that does not fit.
@@ -44,7 +44,7 @@ def evaluate_behaviour(
     from dmcvb_gen.generate.request import behaviour_source
     from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.bundled import bundled_levels
-    from dmcvb_gen.policies.evaluation import maze_scores, running_speed
+    from dmcvb_gen.policies.evaluation import maze_scores
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.policies.simulate import simulate
     from dmcvb_gen.tasks import get_task, task_ids
@@ -66,7 +66,7 @@ def evaluate_behaviour(
             row |= dict(mode=mode, behaviour=behaviour if own else None, returns=return_statistics(out.returns))
             success, speed = maze_scores(task, out)
             if success is not None:
-                row |= dict(success=success, speed=speed, running_speed=running_speed(task, out))
+                row |= dict(success=success, speed=speed)
             rows.append(row | dict(paper=paper_returns(task_id, level)))
     return rows
 

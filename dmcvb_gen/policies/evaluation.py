@@ -77,16 +77,3 @@ def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float
     reached = simulation.terminated
     distance = arithmetic.norm(simulation.state[:, 0, part])
     return float(reached.mean()), goal_speed(distance, simulation.length, reached, task)
-
-
-def running_speed(task: Task, simulation: Simulation) -> float | None:
-    """Root mean square of the torso's speed over all steps of all episodes, m/s; None for a task without a goal.
-
-    How fast the ants run, however well they know the way; standing still counts.
-    """
-    part = task.state_slices.get("walker_position")
-    if part is None:
-        return None
-    moved = np.diff(simulation.state[..., part].astype(np.float64), axis=1)
-    taken = np.arange(moved.shape[1]) < simulation.length[:, None]
-    return float(np.sqrt((moved[taken] ** 2).sum(axis=1).mean()) / task.seconds_per_step)

@@ -13,7 +13,7 @@ from torch import nn
 from dmcvb_gen.agents.catalog import agent_names, make_encoder, make_policy, make_pretrainer, parse_agent
 from dmcvb_gen.agents.data import Sizes
 from dmcvb_gen.agents.dino import DinoEncoder
-from dmcvb_gen.agents.laom import LatentActionObservationModel
+from dmcvb_gen.agents.laom import LatentActionObservationModel, SupervisedLatentActionObservationModel
 from dmcvb_gen.agents.lapo import CODE_WIDTH, LatentActionPolicy
 from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.agents.muon import Muon, is_hidden_matrix
@@ -348,6 +348,19 @@ def test_laoms_inverse_model_sees_the_later_observation_and_its_model_the_next_o
     before = learner.latent_action(batch)
     same = learner.latent_action(dataclasses.replace(batch, later_observation=other.later_observation))
     assert torch.equal(before, same)  # it is labeled by one step
+
+
+def test_laoms_supervised_variant_learns_from_the_actions_of_labeled_transitions_alone():
+    learner, batch = SupervisedLatentActionObservationModel(small_encoder(), SIZES), make_batch()
+    labeled = dataclasses.replace(batch, labeled=make_batch(seed=1))
+    learner.losses(labeled)["labels"].backward()
+    reached = {name.split(".")[0] for name, p in learner.named_parameters() if p.grad is not None}
+    assert reached == {"see", "f", "h"}
+    loss = learner.metrics(labeled)["loss"]
+    assert learner.metrics(dataclasses.replace(labeled, action=batch.action + 9))["loss"] == loss
+    other = dataclasses.replace(labeled.labeled, action=batch.action + 9)
+    assert learner.metrics(dataclasses.replace(labeled, labeled=other))["loss"] > loss + 1
+    assert "labels" not in learner.metrics(batch)
 
 
 def test_a_linear_probe_of_latent_actions_that_know_the_answer():

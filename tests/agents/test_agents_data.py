@@ -99,6 +99,15 @@ def test_the_later_observation_is_k_steps_on_and_the_next_one_a_step():
     assert plain.later_observation is None and torch.equal(plain.next_observation, batch.later_observation)
 
 
+def test_labeled_transitions_are_those_of_some_episodes_and_tests_are_of_others():
+    data = make_data(held=(True, True, False)).with_labels(np.array([0, 2]))
+    drawn = data.labeled().batch(200, np.random.default_rng(0), next_observation=True, shift=False)
+    rows = drawn.reward.long()
+    assert set(rows.tolist()) == {0, 1, 2, 3, 13, 14}
+    torch.testing.assert_close(drawn.next_observation, data.observe(rows + 1))
+    assert set(data.hold_out_rows.tolist()) == set(range(5, 12)) and set(data.train_rows.tolist()) == {13, 14}
+
+
 def _stack(row):
     first = {True: 0}.get(row <= 4, 13)
     return [max(row - 2, first), max(row - 1, first), row]

@@ -133,9 +133,15 @@ def test_b3_has_a_policy_for_each_fixed_goal_whose_episodes_are_all_there(per_go
 @pytest.mark.parametrize("name", ["walker-walk/expert/dynamic", f"{MAZE}/expert/visible"])
 def test_b4_decodes_latent_actions_by_each_label_budget_beside_bc_on_it_and_on_all(name, episodes, budgets):
     found, missing = planned("b4", name, episodes=episodes)
-    setting, agents = name.split("/")[-1], (("bc", ""), ("lapo+bc", "expert"), ("laom+bc", "expert"))
+    latent = (("lapo+bc", "expert"), ("laom+bc", "expert"), ("laom-labels+bc", "expert"))
+    setting, agents = name.split("/")[-1], (("bc", ""), *latent)
     few = {(agent, f"{budget} expert", data, setting) for budget in budgets for agent, data in agents}
     assert found == few | {("bc", "expert", "", setting)} and not missing
+    cells, _ = plan_benchmark("b4", release_of(name, episodes=episodes), [])
+    encoders = {agent: {cell.encoder for cell in cells if cell.agent.name == agent} for agent, _ in latent}
+    assert {agent: len(found) for agent, found in encoders.items()} == {
+        "lapo+bc": 1, "laom+bc": 1, "laom-labels+bc": len(budgets)
+    }  # fmt: skip
 
 
 def test_a_smaller_label_budget_is_a_part_of_a_larger_one_and_hangs_on_the_seed():

@@ -137,15 +137,16 @@ def test_label_budgets_are_validated_on_a_release_of_experts(task, setting, tmp_
     facts = json.loads((tmp_path / "out" / "report.json").read_text())
     assert result.sound, result.failed
     found = {(one["cell"]["agent"], one["labels"]["policy"]): one for one in facts["results"]}
-    assert set(found) == {("bc", "expert"), *((agent, "2 expert") for agent in ("bc", "lapo+bc", "laom+bc"))}
+    latent = ("lapo+bc", "laom+bc")
+    assert set(found) == {("bc", "expert"), *((agent, "2 expert") for agent in ("bc", *latent, "laom-labels+bc"))}
     assert found["lapo+bc", "2 expert"]["episodes"] == 2
-    assert all(found[agent, "2 expert"]["pretraining"]["action_probe"] > 0 for agent in ("lapo+bc", "laom+bc"))
+    assert all(found[agent, "2 expert"]["pretraining"]["action_probe"] > 0 for agent in latent)
     subsets = Release.open(tmp_path / "experts").subsets
     low, high = (subsets[f"{task}/{level}/{setting}"].returns.mean() for level in ("random", "expert"))
     for one in found.values():
         assert one["score"]["normalized"] == pytest.approx(100 * (one["score"]["mean"] - low) / (high - low))
     page = (tmp_path / "out" / "report.html").read_text()
-    assert " BC on all labels" in page and page.count("<br>normalized ") == 4
+    assert " BC on all labels" in page and page.count("<br>normalized ") == 5
     assert len(re.findall(r"probe misses \d+ % of the actions", page)) == 2
 
 

@@ -77,15 +77,6 @@ def test_the_actor_and_the_network_that_learns_agree(tmp_path):
     np.testing.assert_array_equal(policy.act(seen, deterministic=True), wanted)
 
 
-def test_one_that_knows_the_goal_s_direction_walks_as_in_the_open_maze(tmp_path):
-    """Far from the middle of an empty maze, a heading straight at the goal changes what is seen of places alone."""
-    batch = walked(get_task("ant-maze-empty7x7"))
-    seen = batch.behaviour_observation()
-    ant, goal = places(seen)[:, :2], places(seen)[:, 2:]
-    changed = np.flatnonzero((np.abs(open_maze_observation(seen, goal - ant) - seen) > 1e-4).any(axis=0))
-    assert len(changed) == 4  # x and y of ant and of goal
-
-
 def test_places_are_drawn_on_the_floor():
     layout = get_task("ant-maze-medium7x7b").layout
     drawn = draw_places(layout, np.random.default_rng(0), 500)
