@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pydantic
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import write_json
@@ -344,19 +346,10 @@ def selected_header(
 
 def selection_json(selection: Selection) -> dict:
     """A selection as plain values; None for numbers that are not known."""
-    levels = {}
-    for level in TRAINED_LEVELS:
-        picks = [asdict(pick) | {"evaluation": pick.evaluation.model_dump()} for pick in selection.picks.get(level, ())]
-        levels[level] = {"picks": picks, "reason": selection.reasons.get(level)}
-    return {
-        "task": selection.task,
-        "base": selection.base,
-        "convergence": {
-            name: None if isinstance(value, float) and np.isnan(value) else value
-            for name, value in asdict(selection.convergence).items()
-        },
-        "levels": levels,
-    }
+    plain = json.loads(pydantic.TypeAdapter(Selection).dump_json(selection))
+    picks, reasons = plain.pop("picks"), plain.pop("reasons")
+    levels = {level: {"picks": picks.get(level, []), "reason": reasons.get(level)} for level in TRAINED_LEVELS}
+    return plain | {"levels": levels}
 
 
 def plot_curve(folder: str | Path, expert: float | None = None, selection: Selection | None = None) -> Path:
