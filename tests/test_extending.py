@@ -123,4 +123,4 @@ def test_a_benchmark_of_your_own_has_its_table_in_the_report(family, request, tm
     report = validated(request.getfixturevalue(family), tmp_path, "--benchmark", "growth")
     assert {result["labels"]["policy"].split()[-1] for result in report["results"]} >= {"random"}
     assert {result["reference"] for result in report["results"]} == {"the same agent on all episodes"}
-    assert "Growth: scores over shares of the data" in (tmp_path / "report" / "report.md").read_text()
+    assert "Growth: scores over shares of the data" in (tmp_path / "report" / "report.html").read_text()

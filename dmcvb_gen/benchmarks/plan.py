@@ -290,11 +290,9 @@ def goal_cells(subset: Subset, pair: int | None) -> tuple[tuple[int, int], tuple
     if not len(known):
         raise DmcvbError(f"{subset.name} has no episodes of goal pair {pair}; fetch or roll them out")
     state = subset.read("state", known[:1])[0, 0]
-    floor = np.array(task.layout.free)
 
     def cell(field: str) -> tuple[int, int]:
-        place = task.layout.grid(state[task.state_slices[field]][:2])
-        row, column = floor[np.square(floor - place).sum(axis=1).argmin()]
+        row, column = np.rint(task.layout.grid(state[task.state_slices[field]][:2]))
         return int(row), int(column)
 
     return cell("walker_position"), cell("target_position")

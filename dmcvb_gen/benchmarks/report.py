@@ -1,7 +1,7 @@
 """Validate a release: check it, run benchmarks on it, and write one page about it all.
 
-The page is self-contained HTML; its tables lie beside it as Markdown, and all facts as JSON. It shows the results that
-lie in cells/ with the fingerprint of this release and budget; another release or budget means another folder.
+The page is self-contained HTML; all facts lie beside it as JSON. It shows the results that lie in
+cells/ with the fingerprint of this release and budget; another release or budget means another folder.
 Wherever a score stands, the budget that made it stands beside it.
 """
 
@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import html
 import io
 import json
 import math
-import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from dmcvb_gen.agents.catalog import parse_agent
@@ -61,8 +59,6 @@ CHECKS = {
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""
 SHOWN = 200
 """Findings on the page; the JSON file has all."""
-MARKUP = {ord(mark): f"&#{ord(mark)};" for mark in "|\\*_`"}
-"""Written as entities, they mean nothing to any reader of Markdown."""
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 SAMPLES = 2_000
 """Samples of the bootstrap."""
@@ -171,10 +167,9 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
 
 
 def write_report(folder: Path, facts: Mapping[str, Any], results: Results) -> Path:
-    """Write report.html, .md and .json into a folder; gives the path of the page."""
+    """Write report.html and .json into a folder; gives the path of the page."""
     page = folder / "report.html"
     write_json(page.with_suffix(".json"), facts)
-    write_text(page.with_suffix(".md"), render_tables(facts))
     good = [(cell, result) for cell, result in results if "error" not in result]
     write_text(page, render_page(facts, good, folder))
     return page
@@ -305,7 +300,9 @@ def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
       good: results of cells that did not fail. folder: the report's.
     """
     name = facts["budget"]["name"]
-    return _template("report.html.jinja", autoescape=True).render(
+    loader = PackageLoader("dmcvb_gen.benchmarks", "data")
+    jinja = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return jinja.get_template("report.html.jinja").render(
         **_tables(facts),
         curves=[figure_url(figure) for figure in curve_figures(good, name)],
         rollouts=_sheets(good, folder, "rollout"),
@@ -315,21 +312,6 @@ def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
         seconds=facts["seconds"],
         settings=list(((facts["budget"] if facts["cells_planned"] else {}) | facts["versions"]).items()),
     )
-
-
-def render_tables(facts: Mapping[str, Any]) -> str:
-    """Render the page's tables as Markdown, without pictures, times and settings; `facts` as in report.json."""
-    text = _template("report.md.jinja").render(**_tables(facts))
-    return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
-
-
-def _template(name: str, autoescape: bool = False) -> Template:
-    loader = PackageLoader("dmcvb_gen.benchmarks", "data")
-    environment = Environment(
-        loader=loader, autoescape=autoescape, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"cell": _markdown_cell, "score_row": _score_row}
-    return environment.get_template(name)
 
 
 def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -350,17 +332,6 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
         notes=_notes(facts),
         missing=[(m["benchmark"], ", ".join(m["subsets"])) for m in facts["missing"]],
     )
-
-
-def _markdown_cell(value: Any) -> str:
-    """A value in one cell of a table: no bar of its own, no line's end, nothing taken for Markdown or HTML."""
-    text = "" if value is None else html.escape(str(value), quote=False).translate(MARKUP)
-    return "<br>".join(text.replace("](", "]&#40;").splitlines())  # no link; "[smoke]" stays as it is
-
-
-def _score_row(row: Mapping[str, Any]) -> list[str]:
-    """A row of `_scores` in plain text."""
-    return [*row["facts"], "\n".join(row["data"]), *("\n".join(lines or ()) for lines in row["scores"])]
 
 
 def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:

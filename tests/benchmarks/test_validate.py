@@ -13,9 +13,7 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree
 
-import markdown
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -31,7 +29,7 @@ from dmcvb_gen.benchmarks.checks import (
     seen_warnings,
 )
 from dmcvb_gen.benchmarks.plan import BUDGETS, goal_cells, only, plan_benchmark
-from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, curve_figures, render_page, render_tables
+from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, _tables, curve_figures, render_page
 from dmcvb_gen.benchmarks.validate import validate
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
@@ -150,38 +148,19 @@ def test_label_budgets_are_validated_on_a_release_of_experts(task, setting, tmp_
     assert len(re.findall(r"probe misses \d+ % of the actions", page)) == 2
 
 
-def markdown_tables(text):
-    """Tables of a Markdown page as a renderer of Markdown sees them: lists of rows of cells."""
-    page = markdown.markdown(text, extensions=["tables"]).replace("<br>", "\n")
-    rows = [table.iter("tr") for table in ElementTree.fromstring(f"<page>{page}</page>").iter("table")]
-    return [[["".join(cell.itertext()) for cell in row] for row in table] for table in rows]
-
-
-def test_its_tables_stand_in_markdown_too(report):
-    _, out, _ = report
-    facts, text = json.loads((out / "report.json").read_text()), (out / "report.md").read_text()
-    checks, returns, scores, missing = markdown_tables(text)
-    assert [row[0] for row in checks[1:]] == list(CHECKS) and {row[2] for row in checks[1:]} == {"0"}
-    assert all(len(row) == len(table[0]) for table in (checks, returns, scores, missing) for row in table)
-    [(name, values)] = facts["returns"].items()
-    assert returns[1] == [name, *(f"{values[statistic]:.1f}" for statistic in STATISTICS)]
-    shown = {agent: cell for agent, cell in zip(scores[0], scores[1], strict=True) if "[smoke]" in cell}
-    for entry in facts["results"]:
-        lines = shown.pop(entry["cell"]["agent"]).splitlines()
-        assert float(lines[0].split(" ±")[0]) == pytest.approx(entry["score"]["mean"], rel=0.1)
-        assert "paper" not in lines[-1]
-    assert not shown and "This profile claims no score." in text
-
-
-def test_a_message_stays_in_its_cell_of_a_markdown_table(report):
+def test_its_tables_have_the_numbers_of_its_facts(report):
     facts = json.loads((report[1] / "report.json").read_text())
-    message = "a | b\nc \\| *d* _e_ `f` [g](http://h) <script>i</script>"
-    facts["structure"]["findings"] = [dict(check="files", subset="x|y", episode=0, step=None, message=message)]
-    text = render_tables(facts)
-    page = markdown.markdown(text, extensions=["tables"])
-    assert not {"<script", "<a", "<em", "<code"} & set(re.findall("<\\w+", page))
-    found = markdown_tables(text)[1][1]
-    assert found[:4] == ["files", "x|y", "0", ""] and found[4].split() == message.split()
+    tables = _tables(facts)
+    assert [row[0] for row in tables["checks"]] == list(CHECKS) and not any(found for *_, found in tables["checks"])
+    [(name, values)] = facts["returns"].items()
+    assert tables["returns"]["rows"][0] == [name, *(f"{values[statistic]:.1f}" for statistic in STATISTICS)]
+    [scores] = tables["scores"]
+    shown = dict(zip(scores["head"][4:], scores["rows"][0]["scores"], strict=True))
+    for entry in facts["results"]:
+        lines = shown.pop(entry["cell"]["agent"])
+        assert float(lines[0].split(" ±")[0]) == pytest.approx(entry["score"]["mean"], rel=0.1)
+        assert "[smoke]" in lines[0] and "paper" not in lines[-1]
+    assert not shown
 
 
 def test_settings_that_share_trajectories_share_a_row_of_returns(report):
@@ -189,8 +168,7 @@ def test_settings_that_share_trajectories_share_a_row_of_returns(report):
     [(name, values)] = facts["returns"].items()
     place = name.rpartition("/")[0]
     facts["returns"] |= {f"{place}/static": values, "cheetah-run/expert/none": values | {"mean": 1.0}}
-    rows = markdown_tables(render_tables(facts))[1][1:]
-    assert [row[0] for row in rows] == [
+    assert [row[0] for row in _tables(facts)["returns"]["rows"]] == [
         f"{place}/dynamic, static", f"the paper's {place}", "cheetah-run/expert/none", "the paper's cheetah-run/expert"
     ]  # fmt: skip
 
