@@ -6,7 +6,6 @@ Sizes are those of the paper's appendix "Architecture and hyperparameters". Fram
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -188,9 +187,9 @@ def state_encoder(state_size: int) -> Encoder:
 class MLP(nn.Sequential):
     """(batch, inputs) -> (batch, outputs): hidden layers 256, 256 with ReLU; tanh at the end if asked for."""
 
-    def __init__(self, inputs: int, outputs: int, tanh: bool = False, hidden: Sequence[int] = HIDDEN):
+    def __init__(self, inputs: int, outputs: int, tanh: bool = False):
         layers: list[nn.Module] = []
-        for width in hidden:
+        for width in HIDDEN:
             layers += [nn.Linear(inputs, width), nn.ReLU()]
             inputs = width
         super().__init__(*layers, nn.Linear(inputs, outputs), *([nn.Tanh()] if tanh else []))
@@ -221,8 +220,3 @@ class ObservationDecoder(nn.Module):
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
         return self.deconvolutions(self.linear(latent).unflatten(1, self.shape))
-
-
-def state_decoder(state_size: int, features: int = LATENT) -> MLP:
-    """(batch, 64) -> (batch, state): an MLP without activation at the end."""
-    return MLP(features, state_size)

@@ -12,16 +12,7 @@ from torch import nn
 
 from dmcvb_gen.agents.data import Sizes
 from dmcvb_gen.agents.learners import EMA_DECAY, Batch, Learner, Policy, frozen_copy, move_towards, register_agent
-from dmcvb_gen.agents.networks import (
-    LATENT,
-    MLP,
-    PAPER,
-    Architecture,
-    Encoder,
-    ObservationDecoder,
-    initialize,
-    state_decoder,
-)
+from dmcvb_gen.agents.networks import LATENT, MLP, PAPER, Architecture, Encoder, ObservationDecoder, initialize
 
 
 @register_agent("bc")
@@ -152,7 +143,7 @@ class StateProbe(Learner):
 
     def __init__(self, encoder: nn.Module, sizes: Sizes):
         super().__init__()
-        self.encoder, self.h = encoder.requires_grad_(False), state_decoder(sizes.state, encoder.features)
+        self.encoder, self.h = encoder.requires_grad_(False), MLP(encoder.features, sizes.state)
 
     def predict(self, batch: Batch) -> torch.Tensor:
         """(batch, state): the normalized states as the decoder sees them."""

@@ -24,7 +24,6 @@ from dmcvb_gen.agents.networks import (
     FrameDifferences,
     ObservationDecoder,
     observation_encoder,
-    state_decoder,
     state_encoder,
 )
 from dmcvb_gen.agents.paper import (
@@ -210,7 +209,7 @@ def papers_table():
         ("BC action predictor", bc.policy, "tanh", ACTIONS),
         ("LFD predictor", forward.g, "tanh", 64),
         ("Action encoder", forward.embed_action, "tanh", 64),
-        ("State decoder", state_decoder(STATES), "", STATES),
+        ("State decoder", StateProbe(encoder, paper).h, "", STATES),
         ("Actor", td3.net.actor, "tanh", ACTIONS),
         ("Critic 1", td3.net.critic1, "tanh", 1),
         ("Critic 2", td3.net.critic2, "tanh", 1),

@@ -62,7 +62,7 @@ def test_a_functions_own_errors_are_not_hidden(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["sac", "mpo", "validate"])
+@pytest.mark.parametrize("command", ["sac", "validate"])
 def test_what_trains_without_a_compiler_says_so_in_one_line_and_trains(command, small_release, tmp_path):
     if command == "validate":
         words = ["validate", small_release, "--compile", "--agents", "state-bc", "--only", "*/*/none", "--workers", 1]
