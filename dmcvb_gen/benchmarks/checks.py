@@ -152,10 +152,7 @@ def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str
 
 
 def check_structure(
-    release: Release,
-    backgrounds: str | None = None,
-    tick: ProgressCallback = ignore,
-    workers: Workers = 1,
+    release: Release, backgrounds: str | None = None, tick: ProgressCallback = ignore, workers: Workers = 1
 ) -> Structure:
     """All checks of a local release, or of some of its subsets.
 

@@ -32,13 +32,7 @@ def evaluate(
       Return statistics, and the episodes they come from.
     """
     out = simulate(
-        task,
-        [policy],
-        range(episodes),
-        seed,
-        (task.id, streams),
-        deterministic=deterministic,
-        threads=threads,
+        task, [policy], range(episodes), seed, (task.id, streams), deterministic=deterministic, threads=threads
     )
     returns = out.returns
     lowest, lower, middle, upper, highest = map(float, np.quantile(returns, (0, 0.25, 0.5, 0.75, 1)))

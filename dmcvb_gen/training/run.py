@@ -204,10 +204,7 @@ class Run:
     # -- what callers use -------------------------------------------------------------------
 
     def train(
-        self,
-        report: Report = ignore,
-        tick: Callable[[int], Any] = ignore,
-        stopping: Callable[[], Any] = ignore,
+        self, report: Report = ignore, tick: Callable[[int], Any] = ignore, stopping: Callable[[], Any] = ignore
     ) -> None:
         """Train until `config.steps` agent steps, or until Ctrl-C or SIGTERM, which save the run.
 
