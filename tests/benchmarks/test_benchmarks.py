@@ -443,6 +443,7 @@ def test_an_inspection_says_what_it_does_and_needs_no_kept_latents(whole, reques
         assert found[0][name] == pytest.approx(found[1][name], rel=1e-3)
 
 
+@pytest.mark.slow_cases("maze_release")
 @pytest.mark.parametrize("whole", ["small_release", "maze_release"])
 def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(whole, request, tmp_path):
     release = Release.open(request.getfixturevalue(whole))
