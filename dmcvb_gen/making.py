@@ -314,6 +314,7 @@ def regenerate(
     from dmcvb_gen.generate.regenerate import Regeneration, remake
     from dmcvb_gen.generate.request import background_source
     from dmcvb_gen.generate.shipped import load_shipped
+    from dmcvb_gen.storage.places import local_path
 
     if (release is None) == (manifest is None):
         raise DmcvbError("give a RELEASE, or a manifest with --manifest")
@@ -327,6 +328,7 @@ def regenerate(
     if check and out:
         raise DmcvbError("give --check or --out, not both")
     videos = None if backgrounds is None else background_source(backgrounds)
+    out = None if out is None else local_path(out)
     how = Regeneration(release or "", as_names(only), episode_range, videos, workers)
     with progress_bar(progress, " frames") as bar:
         if manifest is not None:

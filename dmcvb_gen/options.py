@@ -23,10 +23,6 @@ from dmcvb_gen.errors import DmcvbError
 if TYPE_CHECKING:
     from dmcvb_gen.progress import ProgressBar
 
-LOCAL = "local"
-"""Mark of a folder or file to write to, which cannot be a URL."""
-
-
 SEVERAL = "several"
 """Mark of names: one may be given alone, or an iterator."""
 RANGE = "range"
@@ -34,7 +30,8 @@ RANGE = "range"
 
 Location = str | Path
 """A folder, a file or a URL."""
-Local = Annotated[Location, LOCAL]
+Local = Location
+"""A folder or file to write to, which functions refuse if it is a URL (`storage.places.local_path`)."""
 Names = Annotated[tuple[Location, ...], SEVERAL]
 """One name or several."""
 Count = Annotated[int, Ge(1)]

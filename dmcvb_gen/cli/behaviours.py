@@ -167,13 +167,14 @@ def _converted(
     from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.bundled import CONVERTED
     from dmcvb_gen.policies.convert import convert_file
+    from dmcvb_gen.storage.places import local_path
 
     allow([task])  # a person typed its name, so its code may run
     if Path(out).suffix in CONVERTED:
         raise PolicyFileError(f"--behaviour would take {out} for another program's file; end its name in .safetensors")
     distribution = actions and {"tanh": "deterministic", "clip": "gaussian"}[actions]
     options = dict(level=level, activation=activation, distribution=distribution, statistics=statistics)
-    return convert_file(Path(source), task, Path(out), **options)
+    return convert_file(Path(source), task, local_path(out), **options)
 
 
 @command_of(_converted, "source", "task")

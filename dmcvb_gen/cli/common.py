@@ -8,7 +8,6 @@ from typing import Any
 
 import click
 
-from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.text import format_bytes, printable
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs instead of tables.")
@@ -100,19 +99,6 @@ def print_json(value: Any) -> None:
 
 def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
-
-
-class OutPath(click.Path):
-    """A folder or file of this machine to write to; refuses URLs."""
-
-    def convert(self, value, param, ctx):
-        from dmcvb_gen.storage.places import local_path
-
-        try:
-            local_path(value)
-        except DmcvbError as error:
-            self.fail(f"{error}.", param, ctx)
-        return super().convert(value, param, ctx)
 
 
 def moved_files(moved: Any) -> str:

@@ -22,8 +22,8 @@ from typing import Any, Literal
 
 import click
 
-from dmcvb_gen.cli.common import GroupedCommand, OutPath, json_option, parse_options
-from dmcvb_gen.options import LOCAL, parts_of
+from dmcvb_gen.cli.common import GroupedCommand, json_option, parse_options
+from dmcvb_gen.options import parts_of
 from dmcvb_gen.parallel import Ray, Workers
 
 METAVARS = {"RANGE": "A:B", "BEHAVIOUR": "FILE|RUN|MODULE:FUNCTION"}
@@ -112,9 +112,7 @@ def help_of(function: Callable) -> dict[str, tuple[str | None, str]]:
 
 
 def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
-    """The click type of an argument: choices, a number with its bounds, a place to write to, or text."""
-    if LOCAL in marks:
-        return OutPath()
+    """The click type of an argument: choices, a number with its bounds, or text."""
     if Literal in map(typing.get_origin, kinds):
         return click.Choice(typing.get_args(kinds[0]))
     if Ray in kinds:

@@ -72,8 +72,8 @@ def download(given: Mapping[str, Any], notify: Callable[[str], None] = ignore) -
     """Do what the arguments of `fetch` ask for: what was moved and, with `paint`, what was rendered."""
     only, episodes = as_names(given["only"]), given["episode_range"]
     with progress_bar(given["progress"], "B") as bar:
-        source = Release.open(given["url"], given["storage_options"])
-        moved = _fetch(source, given["url"], local_path(given["out"]), only, episodes, given["workers"], bar)
+        out, source = local_path(given["out"]), Release.open(given["url"], given["storage_options"])
+        moved = _fetch(source, given["url"], out, only, episodes, given["workers"], bar)
     if not given["paint"]:
         return moved, None
     from dmcvb_gen.making import paint  # here, as it needs a simulator

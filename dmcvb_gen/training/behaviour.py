@@ -102,6 +102,7 @@ def train_behaviour(
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.precision import choose_precision
     from dmcvb_gen.progress import ProgressBar
+    from dmcvb_gen.storage.places import local_path
     from dmcvb_gen.training.run import open_run, read_config
     from dmcvb_gen.training.selection import plot_curve, select_checkpoints
     from dmcvb_gen.training.settings import parse_settings
@@ -110,7 +111,7 @@ def train_behaviour(
     task = found.task if found and not (task or layout) else task_of(task, layout)
     maze = MazeName.parse(task)
     own_maze = bool(maze and maze.rows)
-    folder = Path(out or Path("runs") / (maze.layout if maze and own_maze else task))
+    folder = local_path(out or Path("runs") / (maze.layout if maze and own_maze else task))
     found = read_config(folder) if resume else None
     if resume and found is None:
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
