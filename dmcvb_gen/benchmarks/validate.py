@@ -83,6 +83,7 @@ def validate(
     from dmcvb_gen.benchmarks.cell import default_workers, kept_results, open_data, planned_steps, run_cells
     from dmcvb_gen.benchmarks.checks import check_structure, seen_warnings
     from dmcvb_gen.benchmarks.report import Validation, claim_folder, plan_validation, report_facts, write_report
+    from dmcvb_gen.storage.places import local_path
 
     started = time.perf_counter()
     if checks_only:
@@ -100,7 +101,7 @@ def validate(
     chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
     if patterns:  # a subset that was not asked for is not missing
         missing = [one for one in missing if any(matches(name, patterns) for name in one.subsets)]
-    folder = Path(out or Path("reports") / Path(release).name)
+    folder = local_path(out or Path("reports") / Path(release).name)
     claim_folder(folder, data, budget, training=bool(cells))
     results = []
     with progress_bar(progress, " checks", "structure", scaled=False) as bar:
