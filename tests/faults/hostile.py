@@ -331,13 +331,6 @@ def take_backgrounds(folder: Path) -> None:
         videos.frames(video)
 
 
-def take_published(folder: Path) -> None:
-    from dmcvb_gen.release.fetch import fetch
-
-    fetch(f"file://{folder}/there", folder / "deep/down/here", workers=1)
-    take_release(folder / "deep/down/here")
-
-
 # -- kinds -----------------------------------------------------------------------------------------------------
 
 
@@ -350,26 +343,21 @@ class Kind:
     base: Callable[[], Files] = dict
 
 
-def _one_of_release(choose: Callable[[str], bool], prefix: str = "") -> Callable[[], st.SearchStrategy[Files]]:
-    def cases():
-        names = sorted(name for name in valid_release() if choose(name))
-        changed = [
-            (changed_json if name.endswith(".json") else changed_bytes)(valid_release()[name]).map(
-                lambda data, name=name: {prefix + name: data}
-            )
-            for name in names
-        ]
-        return st.one_of(changed)
+def _one_of_release(start: str, inside: str = "") -> Callable[[], st.SearchStrategy[Files]]:
+    """Cases of one changed file of a release, whose path begins so and has that in it."""
+
+    def changed(name: str) -> st.SearchStrategy[Files]:
+        change = changed_json if name.endswith(".json") else changed_bytes
+        return change(valid_release()[name]).map(lambda data: {name: data})
+
+    def cases() -> st.SearchStrategy[Files]:
+        return st.one_of([changed(name) for name in valid_release() if name.startswith(start) and inside in name])
 
     return cases
 
 
 def _unfinished() -> Files:
     return {name: data for name, data in valid_release().items() if name != "manifest.json"}
-
-
-def _published() -> Files:
-    return {f"there/{name}": data for name, data in valid_release().items()}
 
 
 def _with(prefix: str, files: st.SearchStrategy[Files]) -> st.SearchStrategy[Files]:
@@ -382,12 +370,11 @@ def _recipes() -> st.SearchStrategy[Files]:
 
 
 KINDS: dict[str, Kind] = {
-    "manifest": Kind(_one_of_release(lambda name: name == "manifest.json"), take_release, valid_release),
-    "list": Kind(_one_of_release(lambda name: name.startswith("layers/")), take_release, valid_release),
-    "record": Kind(_one_of_release(lambda name: name.startswith("records/")), take_release, _unfinished),
-    "resolved": Kind(_one_of_release(lambda name: name.startswith("recipes/")), take_release, _unfinished),
-    "chunk": Kind(_one_of_release(lambda name: "/c/" in name), take_release, valid_release),
-    "published": Kind(_one_of_release(lambda name: name.endswith(".json"), "there/"), take_published, _published),
+    "manifest": Kind(_one_of_release("manifest.json"), take_release, valid_release),
+    "list": Kind(_one_of_release("layers/"), take_release, valid_release),
+    "record": Kind(_one_of_release("records/"), take_release, _unfinished),
+    "resolved": Kind(_one_of_release("recipes/"), take_release, _unfinished),
+    "chunk": Kind(_one_of_release("hop/", "/c/"), take_release, valid_release),
     "recipe": Kind(_recipes, take_recipe, lambda: {"recipe.yaml": json.dumps(RECIPE).encode()}),
     "policy": Kind(
         lambda: changed_policy().map(lambda data: {"p.safetensors": data}),
