@@ -13,6 +13,7 @@ import pytest
 from tests.faults.hostile import KINDS, run_kind
 
 
+@pytest.mark.slow_cases("recipe")
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_files_are_refused_in_a_line_or_do_no_harm(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
