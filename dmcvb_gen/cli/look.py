@@ -119,6 +119,7 @@ def list_command(as_json):
     )
     for heading, names in (
         ("tasks of dm_control's suite", facts["suite_tasks"]),
+        ("of these with bundled expert, medium and mixed", facts["suite_behaviours"]),
         ("levels", facts["levels"]),
         ("distractors", facts["distractors"]),
         ("difficulties", [*facts["difficulties"], "or a scale up to 1 (dynamic_0.35)"]),

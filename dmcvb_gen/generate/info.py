@@ -116,6 +116,7 @@ def describe_package() -> dict[str, Any]:
         version=__version__,
         tasks=tasks,
         suite_tasks=list(suite_ids()),
+        suite_behaviours={name: bundled_levels(name) for name in suite_ids() if bundled_levels(name)},
         levels=list(LEVELS),
         distractors=list(distractor_kinds()),
         difficulties=list(DIFFICULTIES),
