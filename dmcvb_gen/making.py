@@ -318,15 +318,10 @@ def regenerate(
 
     if (release is None) == (manifest is None):
         raise DmcvbError("give a RELEASE, or a manifest with --manifest")
-    add = "add --out FOLDER (in Python, out=FOLDER)"
-    if manifest is not None and check:
-        raise DmcvbError(
-            "remove --check: with --manifest, digests are always compared" + ("" if out else f"; and {add}")
-        )
+    if check and (manifest or out):
+        raise DmcvbError("remove --check: with --manifest or --out, digests are always compared")
     if manifest is not None and not out:
-        raise DmcvbError(f"a manifest alone has no shards to repair: {add}")
-    if check and out:
-        raise DmcvbError("give --check or --out, not both")
+        raise DmcvbError("a manifest alone has no shards to repair: add --out FOLDER (in Python, out=FOLDER)")
     videos = None if backgrounds is None else background_source(backgrounds)
     out = None if out is None else local_path(out)
     how = Regeneration(release or "", as_names(only), episode_range, videos, workers)
