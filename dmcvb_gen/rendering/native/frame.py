@@ -36,6 +36,7 @@ class Frames(NamedTuple):
     rgb: np.ndarray  # (frame, material, 3)
     look: np.ndarray  # (frame,) row of the looks' records
     sky: np.ndarray  # (frame,) texture of the sky; -1: none
+    inside: np.ndarray  # (frame,) bool, the eye is inside one of the solid boxes behind walls
 
 
 class SceneConstants(NamedTuple):
@@ -44,7 +45,6 @@ class SceneConstants(NamedTuple):
     looks: np.ndarray  # (look, geom, column) the first columns of `rec`
     constants: np.ndarray  # the first entries of `k`
     lamps: np.ndarray  # (lamp, 12) their SPOT and CONE; one of zeros if there are none
-    boxes: np.ndarray  # (box, 6) solid boxes behind walls, lowest and highest corner
     texels: np.ndarray  # see textures
     width: int  # of a row of the table of textures
     rays: np.ndarray  # see visibility.sample_rays
@@ -196,18 +196,6 @@ def swap_with_image(rec, g):
         for i in range(count):
             rec[g, there + i], rec[g, here + i] = rec[g, here + i], rec[g, there + i]
     return visibility.plane_functions(rec, g)
-
-
-@part
-def in_a_box(boxes, eye, f):
-    """Return True if the eye is inside one of the solid boxes."""
-    for b in range(boxes.shape[0]):
-        inside = True
-        for axis in range(3):
-            inside = inside and boxes[b, axis] < eye[f, axis] < boxes[b, 3 + axis]
-        if inside:
-            return True
-    return False
 
 
 # -- visibility ------------------------------------------------------------------------------------
@@ -632,7 +620,6 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
         pose(scene, frames, scratch, f, pixels)
         face_planes(rec)
         light_frame(scene, frames, scratch, f, i8(0))
-        inside = in_a_box(scene.boxes, frames.eye, f)
         known = known and same_sky(axes, sky, f)
         if not known and same_sky(axes, sky, f + 1):
             jobs, color = scratch.jobs, scratch.color
@@ -661,7 +648,7 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
                     continue
             elif step > 0:
                 continue
-            paint(scene, frames, scratch, f, which, inside, known, picture)
+            paint(scene, frames, scratch, f, which, frames.inside[f], known, picture)
 
 
 @entry

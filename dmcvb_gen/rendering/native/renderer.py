@@ -131,15 +131,18 @@ class NativeRenderer(Renderer):
             lamp[..., :3], lamp[..., 3:] = place[:, scene.lamps], direction[:, scene.lamps]
             lamp[..., :3] -= self._far_away[:, None] * lamp[..., 3:]
         center, turn = _poses(scene, poses)
+        eye = np.ascontiguousarray(exogenous.camera_position[:, view], np.float64)
+        within = (scene.boxes[:, :3] < eye[:, None]) & (eye[:, None] < scene.boxes[:, 3:])
         return Frames(
             center=center,
             turn=turn,
-            eye=np.ascontiguousarray(exogenous.camera_position[:, view], np.float64),
+            eye=eye,
             axes=np.ascontiguousarray(matrices(exogenous.camera_quaternion[:, view].astype(np.float64))),
             lamp=lamp,
             rgb=np.ascontiguousarray(exogenous.material_rgb, np.float64),
             look=np.array([self._look(style) for style in exogenous.style.tolist()], np.int64),
             sky=np.array(sky, np.int64),
+            inside=within.all(axis=2).any(axis=1),
         )
 
     def _look(self, style: int) -> int:
@@ -161,7 +164,6 @@ class NativeRenderer(Renderer):
             looks=self._records,
             constants=constants,
             lamps=scene.shine,
-            boxes=scene.boxes,
             texels=self._textures.texels,
             width=self._textures.table.shape[1],
             rays=sample_rays(self.size, step, centers),

@@ -243,7 +243,7 @@ def _refuse_what_is_not_painted(
     model, cameras = task.model, camera_ids(task)
     materials = np.unique(material[material >= 0])
     lights = np.flatnonzero(model.light_active)
-    others = [mujoco.mjtGeom(number).name[7:].lower() for number in set(kind.tolist()) - set(_PAINTED)]
+    others = [mujoco.mjtGeom(number).name[7:].lower() for number in sorted({*kind.tolist()} - {*_PAINTED})]
     textures = _of_materials(model.mat_texid, material)[:, mujoco.mjtTextureRole.mjTEXROLE_RGB]
     textures = np.where(material >= 0, textures, -1)
     textured, types = kind[textures >= 0], model.tex_type[textures[textures >= 0]]
