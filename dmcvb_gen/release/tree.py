@@ -126,9 +126,11 @@ def release_at(store: Store, release: Release) -> Release | None:
         )
     ours = {COPY, *(f"{RECIPES}{recipe.sha256}.json" for recipe in release.recipes)}
     ours |= {file.path for file in release.manifest.inputs}
-    folders = folders_of(release)
-    others = [path for path in store.list() if path not in ours and not path.startswith(folders)]
-    if others := [path for path in others if not is_attachment(path)]:
+    folders, found = folders_of(release), list(store.list())
+    others = [path for path in found if path not in ours and not path.startswith(folders)]
+    if len(others) < len(found) or not store.writable:  # a try began, or a new repository on the Hub has a README
+        others = [path for path in others if not is_attachment(path)]
+    if others:
         more = f" and {len(others) - 1} more" if others[1:] else ""
         raise StoreError(f"{store.place} holds {others[0]}{more}, and not this release; choose an empty destination")
     return None

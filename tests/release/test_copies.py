@@ -121,14 +121,18 @@ def test_a_grown_release_takes_the_place_of_the_older(made, place, tmp_path):
         fetch(f"file:{tmp_path / 'old'}", back)
 
 
-def test_what_is_no_part_of_it_stays_as_it_is(made, tmp_path):
+@pytest.mark.parametrize("name", ["notes.txt", "README.md"])
+def test_a_folder_of_something_else_stays_as_it_is(name, made, tmp_path):
     (tmp_path / "full").mkdir()
-    (tmp_path / "full/notes.txt").write_text("mine")
-    with pytest.raises(StoreError, match="holds notes.txt, and not this release"):
+    (tmp_path / "full" / name).write_text("mine")
+    with pytest.raises(StoreError, match=f"holds {name}, and not this release"):
         fetch(f"file:{made}", tmp_path / "full")
     with pytest.raises(StoreError, match="choose an empty destination"):
         publish(made, f"file:{tmp_path / 'full'}")
-    assert content(tmp_path / "full") == {"notes.txt": b"mine"}
+    assert content(tmp_path / "full") == {name: b"mine"}
+
+
+def test_a_folder_of_another_release_stays_as_it_is(made, tmp_path):
     with pytest.raises(StoreError, match="is the release itself"):
         fetch(f"file:{made}", made)
     make(open_store(tmp_path / "other"), recipe(2, name="other"))
