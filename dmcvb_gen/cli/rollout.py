@@ -53,11 +53,13 @@ def rollout(dry_run, as_json, progress, workers, other_versions, **options):
         --distractor none --distractor dynamic --out releases/mine
     dmcvb-gen rollout --recipe dmcvb-mini --only 'walker-walk/*/static'
     """
+    from dmcvb_gen.generate.counts import check_room
     from dmcvb_gen.generate.plan import start
 
     plan = _plan(options)
     if dry_run:
         return _show_plan(plan, as_json)
+    check_room(plan)
     start(plan, other_versions)
     _run(plan, workers, as_json)
 

@@ -9,8 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmcvb_gen.dataset.manifest import Layer
+from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import free_bytes
 from dmcvb_gen.generate.plan import Plan
 from dmcvb_gen.generate.works import episodes_left
+from dmcvb_gen.text import format_bytes
+
+LEAST_SHARE = 0.05
+"""Share of their raw bytes that arrays take after compression, at the very least."""
 
 
 @dataclass(frozen=True)
@@ -53,3 +59,13 @@ def count(plan: Plan) -> tuple[SubsetCount, ...]:
 def _row_bytes(layer: Layer) -> int:
     """Bytes of a row of an episode: all arrays that have a value for each step."""
     return sum(math.prod(spec.shape) * np.dtype(spec.dtype).itemsize for spec in layer.arrays if spec.steps)
+
+
+def check_room(plan: Plan) -> None:
+    """Raises StoreError if what a plan makes cannot fit on the disk of its folder, however well it is compressed."""
+    needed = LEAST_SHARE * sum(subset.raw_bytes for subset in count(plan))
+    if plan.store.folder and needed > (free := free_bytes(plan.store.folder)):
+        raise StoreError(
+            f"at least {format_bytes(needed)} are needed and {format_bytes(free)} are free at {plan.store.place}; "
+            "make room, choose another --out or fewer --episodes"
+        )

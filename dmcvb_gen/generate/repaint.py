@@ -8,7 +8,7 @@ give.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,6 +94,7 @@ def repaint(request: Repainting, workers: Workers | None = None, progress: Progr
             )
         layers |= {layer.name: layer for layer in made}
         records[record.name] = record.model_copy(update={"layers": tuple(layer.name for layer in made)})
+    _check_options_used(request, records.values())
     old = release.manifest
     resolved = recipe_after(
         release,
@@ -166,6 +167,15 @@ def _new_setting(old: SubsetRecord, distractor: str | None) -> str:
     if is_maze(old.task):
         raise RecipeError(f"{old.name} varies in style, not by distractor; remove --distractor or use --only")
     return DistractorSetting.parse(distractor).name
+
+
+def _check_options_used(request: Repainting, records: Iterable[SubsetRecord]) -> None:
+    """Refuse options of videos if none of the new subsets shows any."""
+    videos = any(record.distractor.shows_videos for record in records)
+    heard = {"backgrounds": videos, "split": videos or any(is_maze(record.task) for record in records)}
+    for name, has_effect in heard.items():
+        if getattr(request, name) and not has_effect:
+            raise RecipeError(f"--{name} has no effect: these subsets show no videos; remove it")
 
 
 def _check_out(store: Store, resolved: Resolved) -> None:

@@ -71,6 +71,8 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
     changes |= _renderer(given, made)
     made = override(made, **changes) if changes else made
     check_options_used(made, given)
+    if given.get("sample") and is_own(str(given.get("behaviour") or "")):
+        raise RecipeError("--sample has no effect: a function of your own draws by itself; remove it")
     return made
 
 

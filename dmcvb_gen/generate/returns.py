@@ -50,8 +50,7 @@ def evaluate_behaviour(
     from dmcvb_gen.tasks import get_task, task_ids
 
     behaviour = behaviour_source(behaviour)
-    for level in as_names(levels):
-        Level.parse(level)
+    _check_levels(as_names(levels), behaviour, sample)
     chosen, asked = _of_behaviour(behaviour, as_names(tasks), as_names(levels)) if behaviour else (tasks, levels)
     chosen = as_names(chosen) or tuple(task_id for task_id in task_ids() if bundled_levels(task_id))
     rows = []
@@ -69,6 +68,17 @@ def evaluate_behaviour(
                 row |= dict(success=success, speed=speed)
             rows.append(row | dict(paper=paper_returns(task_id, level)))
     return rows
+
+
+def _check_levels(levels: Sequence[str], behaviour: str | None, sample: bool) -> None:
+    for level in levels:
+        Level.parse(level)
+    if set(levels) != {Level.RANDOM}:
+        return
+    if behaviour:
+        raise DmcvbError("--behaviour has no effect: level random has no policy; ask for another, or remove it")
+    if sample:
+        raise DmcvbError("--sample has no effect: level random is always drawn; ask for another, or remove it")
 
 
 def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:

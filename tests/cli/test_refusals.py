@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import dmcvb_gen
 from dmcvb_gen.cli.common import parse_options
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.counts import LEAST_SHARE
 from dmcvb_gen.options import with_parameters
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
@@ -65,6 +67,7 @@ ROLLOUTS = [
     ("walker-walk --backgrounds builtin", "--distractor static or dynamic"),
     ("walker-walk --distractor dynamic_camera-light --split val", "shows videos"),
     ("walker-walk --level random --sample", "level random is always drawn"),
+    ("walker-walk --behaviour mine:swing --sample", "a function of your own draws by itself"),
     ("--recipe dmcvb-mini walker-walk --distractor none --split val", "--distractor static or dynamic"),
     ("--recipe dmcvb-mini walker-walk --level random --sample", "level random is always drawn"),
 ]
@@ -76,6 +79,10 @@ OTHERS = [
     ("info r --option a=b", "r is a folder"),
     ("info s3://", "s3:// names no bucket; give s3://BUCKET/NAME"),
     ("diff a b c", "see `dmcvb-gen diff --help`"),
+    ("evaluate-behaviour walker-walk --level random --sample", "level random is always drawn"),
+    ("evaluate-behaviour --level random --behaviour walker.safetensors", "level random has no policy"),
+    ("repaint r --only */none --split val --out new", "these subsets show no videos"),
+    ("repaint r --only */none --backgrounds builtin --out new", "these subsets show no videos"),
     ("status r --option a=b", "r is a folder"),
     ("rollout --out r --seed 5", "TASKs or --recipe"),
     ("cluster part r 3/2", "K from 1 to N"),
@@ -194,3 +201,12 @@ def test_functions_refuse_what_their_commands_do_and_name_parameters(call, messa
 ])  # fmt: skip
 def test_messages_of_functions_name_parameters(message, named):
     assert with_parameters(message) == named
+
+
+def test_a_disk_that_cannot_hold_the_release_is_told_before_any_work(tmp_path, monkeypatch):
+    """20 episodes of 61 images take 20 x 61 x 16 x 16 x 3 bytes and more before compression."""
+    words = "walker-walk --level random --episodes 20 --max-steps 60 --size 16 --out".split()
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=LEAST_SHARE * 20 * 61 * 16 * 16 * 3))
+    said = invoke("rollout", *words, tmp_path / "r", code=2).output
+    assert re.match(r"error: at least .*B are needed and .*B are free at .*; make room", said), said
+    assert not (tmp_path / "r").exists()
