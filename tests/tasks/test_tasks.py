@@ -60,8 +60,14 @@ def actions_of(kind, rng, size):
     return rng.uniform(-1, 1, size)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind, repeat", [("random", 2), ("extreme", 2), ("zero", 2), ("random", 1), ("random", 4)])
+@pytest.mark.parametrize(
+    "kind, repeat",
+    [
+        ("random", 4),
+        *(pytest.param(kind, 2, marks=pytest.mark.slow) for kind in ("random", "extreme", "zero")),
+        pytest.param("random", 1, marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):
     task = get_task(task_id).at(repeat)
@@ -250,7 +256,7 @@ def test_an_unknown_task_lists_the_known_ones_and_the_nearest():
     with pytest.raises(UnknownNameError, match="Did you mean 'walker-walk'.*walker-run.* and .* more") as caught:
         get_task("walker-wakl")
     assert len(str(caught.value)) < 300
-    with pytest.raises(UnknownNameError, match="unknown task 'zzzz'. Known: [a-z-]+, .* and .* more"):
+    with pytest.raises(UnknownNameError, match="unknown task 'zzzz'. Known: [a-z0-9-]+, .* and .* more"):
         get_task("zzzz")
     for domain, name in (("walker", "walker-walk"), ("humanoid", "humanoid-walk"), ("ant-maze", "ant-maze-empty7x7")):
         with pytest.raises(UnknownNameError, match=f"Did you mean '{name}'"):  # DMC-VB's own come first
