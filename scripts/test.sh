@@ -23,8 +23,8 @@ if [ -z "${TMPDIR:-}" ] && [ "$(df --output=avail /dev/shm 2>/dev/null | tail -1
   export TMPDIR
   trap 'rm -rf "$TMPDIR"' EXIT
 fi
-# Two processes, each with one file of tests at a time: more would need more memory than small machines have.
+# Two processes: more would need more memory than small machines have. Who has no tests left takes some of the other's.
 # One thread each for numerics: more threads than cores only wait for each other.
 export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
-python -m pytest -n "$(python -c 'import os; print(min(2, os.cpu_count() or 1))')" --dist loadfile \
+python -m pytest -n "$(python -c 'import os; print(min(2, os.cpu_count() or 1))')" --dist worksteal \
   --cpu-times 60 "${tier[@]}" "$@"

@@ -25,7 +25,8 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_cache_that_fails_stops_nothing(monkeypatch, fault):
+def test_a_cache_that_fails_stops_nothing(monkeypatch, tmp_path, fault):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))  # which has nothing of an earlier run
     monkeypatch.setattr(*FAULTS[fault])
     assert kept_njit(nogil=True)(double)(21) == 42
     if fault != "a folder that cannot be read":

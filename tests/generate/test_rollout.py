@@ -71,6 +71,7 @@ def test_settings_show_the_same_episodes_and_are_stored_once(small_release):
     assert len({layer.key for layer in make_plan(alone, "nowhere").release.layers.values()}) == 9
 
 
+@pytest.mark.slow_cases("maze_recipe")
 @pytest.mark.parametrize("recipe", [short_recipe, maze_recipe])
 def test_a_release_grows_without_touching_what_is_there(recipe, tmp_path):
     """From 3 episodes in shards of 2 (mazes: 2 in shards of 1) to 5, by the same command with another number."""

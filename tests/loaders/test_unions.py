@@ -29,6 +29,7 @@ def in_order(batches):
     return {name: value[order] for name, value in values.items()}
 
 
+@pytest.mark.slow_cases("ant-maze-empty7x7")
 def test_every_form_gives_the_steps_of_both_parts(levels):
     folder, parts = levels
     union = dmcvb_gen.open(folder).union(*parts)
@@ -54,6 +55,7 @@ def test_every_form_gives_the_steps_of_both_parts(levels):
     assert union.bytes == sum(dmcvb_gen.open(folder)[name].bytes for name in parts)
 
 
+@pytest.mark.slow_cases("ant-maze-empty7x7")
 def test_fresh_distractors_of_a_union_come_with_the_epoch(levels):
     folder, parts = levels
     union = dmcvb_gen.open(folder, paint=True, distractors="resample").union(*parts)

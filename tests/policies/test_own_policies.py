@@ -142,6 +142,7 @@ def test_a_functions_noise_comes_from_each_episodes_own_stream(task, code, tmp_p
     np.testing.assert_array_equal(first.read("action"), second.read("action"))
 
 
+@pytest.mark.slow_cases("maze")
 def test_other_code_of_the_same_name_is_refused(code, task, tmp_path, monkeypatch):
     done("rollout", task.id, *TINY, "--behaviour", f"{code}:noisy", "--out", tmp_path / "r")
     (tmp_path / f"{code}.py").write_text(CODE.format(actions=task.action_size) + "\n# changed\n")
