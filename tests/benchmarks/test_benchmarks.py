@@ -596,6 +596,7 @@ def test_scores_ranked_as_the_papers_agree_and_reversed_ones_do_not():
     assert rank["rho"] == -1.0
 
 
+@pytest.mark.slow
 def test_ratios_are_shares_of_the_data_and_rho_is_by_task_and_together():
     """By hand: walker's data returned 958, cheetah's 890, humanoid's 766 in the paper, ours 100 throughout."""
     papers = {"walker-walk": 958, "cheetah-run": 890, "humanoid-walk": 766}

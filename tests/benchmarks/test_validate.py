@@ -236,6 +236,7 @@ def test_another_release_or_budget_means_another_folder(scored, small_mazes, tmp
     assert (out / "report.json").read_text() == before
 
 
+@pytest.mark.slow
 def test_a_release_that_grows_is_the_same_and_its_cells_are_made_again(scored, tmp_path):
     def grown(episodes):
         pattern = {"tasks": "walker-walk", "levels": "random", "settings": ["none"], "episodes_per_shard": 1}

@@ -86,7 +86,13 @@ TARGETS = {
 }
 
 
-CASES = [(c, t, d) for c in COMMANDS for t in TARGETS for d in DAMAGES if c == "verify" or d in ("garbage", "missing")]
+CASES = [
+    pytest.param(command, target, damage, marks=pytest.mark.slow if command == "regenerate" else ())
+    for command in COMMANDS
+    for target in TARGETS
+    for damage in DAMAGES
+    if command == "verify" or damage in ("garbage", "missing")
+]
 
 
 @pytest.mark.parametrize(("command", "target", "damage"), CASES)

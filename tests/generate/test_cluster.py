@@ -52,6 +52,7 @@ def contents(folder):
     return {name: path.read_bytes() for name, path in paths.items() if not name.startswith((".", "provenance"))}
 
 
+@pytest.mark.slow_cases("file://{}/bucket")
 @pytest.mark.parametrize("place", ["folder", "file://{}/bucket"])
 def test_parts_made_anywhere_give_the_files_of_one_rollout(whole, recipe_file, tmp_path, place):
     place = place.format(tmp_path) if "://" in place else tmp_path / place

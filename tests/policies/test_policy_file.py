@@ -217,6 +217,7 @@ def test_a_missing_level_says_how_to_get_it(tmp_path):
 # -- mean actions by default, drawn ones on request -------------------------------------------------
 
 
+@pytest.mark.slow_cases("ant-maze-empty7x7-visible")
 @pytest.mark.parametrize("task, setting", [("walker-walk", "none"), ("ant-maze-empty7x7", "visible")])
 def test_recipes_take_mean_actions_unless_told_to_draw_and_manifests_say_so(tmp_path, task, setting):
     def planned(**fields):

@@ -285,6 +285,7 @@ def test_an_interrupted_export_goes_on_and_folders_are_named_as_out_names_them(s
     assert not [path for path in tmp_path.rglob(".*") if path.name != STAMP]
 
 
+@pytest.mark.slow
 def test_of_unfinished_releases_only_the_same_one_counts_as_exported(tmp_path):
     for name, seed in (("a", 3), ("b", 4)):
         release = roll_out(small_recipe(seed=seed), tmp_path / name, works=lambda works: works[:1])

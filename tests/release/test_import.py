@@ -65,6 +65,7 @@ def test_an_imported_release_keeps_its_pictures(imported, tmp_path):
         dmcvb_gen.open(str(imported), paint=True)
 
 
+@pytest.mark.slow_cases("mazes")
 @pytest.mark.parametrize("family", ["locomotion", "mazes"])
 def test_the_card_of_imported_data_fits_and_claims_nothing_that_it_has_not(request, small_mazes, tmp_path, family):
     folder = tmp_path / "r"

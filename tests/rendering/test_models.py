@@ -169,6 +169,7 @@ def test_the_chosen_renderer_draws_what_mujoco_draws(name, tmp_path):
         assert off.mean() <= 3 and off.reshape(8, 8, 8, 8).mean(axis=(1, 3)).max() <= 25
 
 
+@pytest.mark.slow_cases("humanoid-walk")
 @needs_opengl
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_opengl_without_distractors_is_mujocos_picture(task_id):
@@ -190,6 +191,7 @@ def draw_episode(physics, random):
     draw_looks(physics.model._model, physics.data)
 
 
+@pytest.mark.slow
 @needs_opengl
 def test_what_an_episode_draws_is_rendered_unless_the_distractor_replaces_it(tmp_path, caplog):
     named = model(lamp=LAMP_WITH.format('name="lamp"'))

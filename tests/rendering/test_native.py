@@ -137,6 +137,7 @@ def test_a_background_on_the_sky_is_what_pillow_makes_of_it(shape):
     np.testing.assert_array_equal(found, np.concatenate([packed(level) for level in levels(last)[1:]]))
 
 
+@pytest.mark.slow
 def test_what_it_does_not_paint_is_refused():
     with pytest.raises(RenderingError, match="dog-walk has geoms of type mesh, .* use --renderer opengl"):
         make_renderer("native", get_task("dog-walk"), 64)

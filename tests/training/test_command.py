@@ -92,6 +92,7 @@ def test_one_command_sets_every_bundled_level_beside_the_paper():
             assert row["paper"] == paper_returns(row["task"], row["level"])
 
 
+@pytest.mark.slow
 def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
     (file,) = bundled_policies("walker-walk", "medium")
     (row,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--json"))

@@ -188,6 +188,7 @@ def largest_file(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_while_saving_leaves_the_previous_state(tmp_path):
     train(tmp_path / "run", steps=80)
     path = tmp_path / "run" / "resume" / STATE
@@ -364,6 +365,7 @@ def test_a_policy_that_does_not_fit_begins_no_run(tmp_path, changes, words):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow_cases("maze-4-20")
 @pytest.mark.parametrize(("case", "share", "most"), [("sac", 8, 20), ("maze", 4, 20), ("guided", 40, 60)])
 def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp_path, monkeypatch, case, share, most):
     """Counted from outside: agent steps that evaluations were asked to simulate, for those that were trained."""

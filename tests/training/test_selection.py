@@ -247,6 +247,7 @@ def cost_task(tmp_path, monkeypatch):
     return f"{name}:push"
 
 
+@pytest.mark.slow
 def test_the_command_after_the_training_of_an_own_task_can_be_run_as_it_is(cost_task, monkeypatch):
     cut = {"warmup_steps": 10, "simulations": 2, "batch_size": 4, "compile": False, "bfloat16": False}
     words = [word for name, value in cut.items() for word in ("--set", f"{name}={value}")]
