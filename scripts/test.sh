@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Sets everything up on a fresh machine (Python 3.11, pip) and runs the checks.
-#   bash scripts/test.sh [pytest options]          the linters and the fast tests: about 5 minutes on two cores
+#   bash scripts/test.sh [pytest options]          the linters and the fast tests: about 4 minutes on two cores
 #   bash scripts/test.sh --all [pytest options]    the slow tests too
 #   bash scripts/test.sh --full [pytest options]   every test: pages, examples, the suite, emulated processors, every kill
 # Tests without the mark slow that compute for more than 2.5 s are listed at the end.

@@ -67,6 +67,7 @@ def test_it_travels_light_and_is_painted_on_arrival(made, tmp_path):
     assert here.digest == there.digest and not any(subset.unpainted.any() for subset in here.subsets.values())
 
 
+@pytest.mark.slow_cases("mazes")
 def test_it_is_repainted_in_another_style_and_size(made, tmp_path):
     folder = made[2]
     run("repaint", folder, "--size", 24, "--split", "val", "--out", tmp_path / "val")

@@ -429,7 +429,7 @@ OVERFIT = {
 }
 
 
-@pytest.mark.slow_cases("ae", "td3-bc")
+@pytest.mark.slow_cases("ae", "lapo", "td3-bc")
 @pytest.mark.parametrize("kind", OVERFIT)
 def test_each_learner_overfits_eight_transitions(kind):
     make, updates, share = OVERFIT[kind]

@@ -60,7 +60,7 @@ def test_painting_a_light_release_gives_the_records_of_a_painted_one(made, light
     assert "All local shards have images already" in invoke("paint", light).output
 
 
-@pytest.mark.slow_cases("maze")
+@pytest.mark.slow
 def test_a_part_can_be_painted_and_the_rest_says_how(made, light):
     name = next(iter(Release.open(light)))
     done = paint_release(light, only=[name], episodes=(0, 1))

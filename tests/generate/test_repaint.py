@@ -65,7 +65,7 @@ def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, n
     assert verify(tmp_path / "r").sound
 
 
-@pytest.mark.slow_cases("small_mazes-*/*/hidden-ant-maze-tiny/random/hidden")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "source, only, name",
     [

@@ -15,6 +15,7 @@ NAMES = ["walker-walk/expert/dynamic", f"{TINY_MAZE}/random/visible", "walker-wa
 SHORT = dict(size=16, max_steps=6, progress=False)
 
 
+@pytest.mark.slow_cases(f"{TINY_MAZE}/random/visible")
 @pytest.mark.parametrize("name", NAMES)
 def test_one_call_gives_data_and_their_environment_and_makes_them_once(name, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

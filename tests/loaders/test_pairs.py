@@ -65,6 +65,7 @@ def test_a_pair_shows_each_state_under_both_settings_in_every_form(made, which):
     assert next(iter(pairs.batches(4, pictures="agents", next_step=True)))["next_pixels"].shape[:2] == (4, 2)
 
 
+@pytest.mark.slow_cases("ant-maze-tiny")
 def test_settings_that_are_not_stored_or_named_twice_are_fresh_and_change_with_the_epoch(made):
     folder, names = made
     first, second = FAMILIES[names[0].split("/")[0]]

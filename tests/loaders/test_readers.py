@@ -224,6 +224,7 @@ def test_a_digest_from_outside_is_compared(small_release):
             other()
 
 
+@pytest.mark.slow_cases("small_mazes-True")
 @pytest.mark.parametrize("in_memory", [True, False])
 @pytest.mark.parametrize("release", ["small_release", "small_mazes"])
 def test_a_batch_of_no_steps_is_an_empty_batch(release, in_memory, request):

@@ -92,6 +92,7 @@ def test_a_part_is_a_copy_that_can_be_completed(made, tmp_path):
     assert content(part) == content(made)
 
 
+@pytest.mark.slow_cases("bucket")
 def test_without_images_it_is_a_copy_of_the_same_digest(made, place, tmp_path):
     (url, options), back = place, tmp_path / "back"
     publish(made, url, pixels=False, **options)
@@ -104,6 +105,7 @@ def test_without_images_it_is_a_copy_of_the_same_digest(made, place, tmp_path):
     assert publish(back, f"file:{tmp_path / 'x'}", pixels=False).moved
 
 
+@pytest.mark.slow_cases("bucket")
 def test_a_grown_release_takes_the_place_of_the_older(made, place, tmp_path):
     (url, options), back = place, tmp_path / "back"
     publish(made, url, **options)

@@ -169,7 +169,7 @@ def test_the_chosen_renderer_draws_what_mujoco_draws(name, tmp_path):
         assert off.mean() <= 3 and off.reshape(8, 8, 8, 8).mean(axis=(1, 3)).max() <= 25
 
 
-@pytest.mark.slow_cases("humanoid-walk")
+@pytest.mark.slow_cases("humanoid-walk", "cheetah-run")
 @needs_opengl
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_opengl_without_distractors_is_mujocos_picture(task_id):

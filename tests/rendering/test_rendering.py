@@ -46,7 +46,7 @@ class RendererTests:
 
     name: str
 
-    @pytest.mark.slow_cases("none")
+    @pytest.mark.slow
     @pytest.mark.parametrize("setting_name", ["none", "dynamic"])
     def test_a_frame_does_not_depend_on_the_frames_beside_it(self, setting_name):
         task, setting, physics, labels = frames_of("humanoid-walk", setting_name)

@@ -188,6 +188,7 @@ def test_what_fails_late_names_task_episode_and_step(case):
         rolled(task, [8])
 
 
+@pytest.mark.slow
 def test_an_environment_is_used_again_only_if_nothing_of_an_episode_is_left_in_it():
     for case, expected in ((h.WritesIntoTheSimulation, True), (h.DrawsItsModel, False), (h.CountsEpisodes, False)):
         assert task_of(case).reusable is expected

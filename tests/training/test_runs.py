@@ -143,6 +143,7 @@ def test_a_signal_saves_a_run_that_goes_on_to_the_same_bits_and_a_second_one_doe
         assert_same_run(train(tmp_path / "whole", case=case), resumed)
 
 
+@pytest.mark.slow
 def test_what_is_learned_does_not_depend_on_how_often_it_is_evaluated(tmp_path):
     often, once = (train(tmp_path / str(every), every=every) for every in (40, 1000))
     assert (names(often), names(once)) == ([40, 80, 120, 160], [160])  # the last step always has one
