@@ -12,7 +12,7 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import MANIFEST, ZARR_JSON
 from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.release.episode_table import COLUMNS, PICTURE, TABLE
+from dmcvb_gen.release.episode_table import COLUMNS, TABLE
 from dmcvb_gen.release.templates import fill
 from dmcvb_gen.storage.hugging_face import HubStore
 from dmcvb_gen.storage.places import shown
@@ -21,7 +21,7 @@ from dmcvb_gen.storage.store import open_store
 PROGRAM = "dmcvb-gen"
 HOME = "https://arxiv.org/abs/2409.18330"
 """The page of the benchmark that releases follow."""
-TYPES = {"string": "sc:Text", "bool": "sc:Boolean", "double": "sc:Float", str(PICTURE): "sc:ImageObject"}
+TYPES = {"string": "sc:Text", "bool": "sc:Boolean", "float64": "sc:Float", "image": "sc:ImageObject"}
 """Types of the table of episodes that are no integers."""
 FIELDS = {
     "name": ("sc:Text", "task/level/distractor"),
@@ -112,7 +112,7 @@ def croissant(
         folders=[f"{group}/**" for group in groups(release)],
         fields=FIELDS,
         rows=_rows(release, facts),
-        columns={name: (TYPES.get(str(kind), "sc:Integer"), text) for name, (kind, text) in COLUMNS.items()},
+        columns={name: (TYPES.get(kind, "sc:Integer"), text) for name, (kind, text) in COLUMNS.items()},
         table=TABLE,
     )
     return json.dumps(json.loads(text), indent=1) + "\n"

@@ -9,11 +9,9 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
@@ -23,6 +21,9 @@ from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
 TABLE = f"{CARD_FOLDER}episodes.parquet"
 CONFIG = {"config_name": "episodes", "default": True, "data_files": [{"split": "train", "path": TABLE}]}
 """Where the Hub finds the table, for the card's header."""
@@ -30,19 +31,17 @@ FRAME = 64
 """Largest width and height of a first frame in pixels."""
 ROWS = 500
 """Episodes that are in memory at a time, and in one row group of the file."""
-PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-"""How `datasets` stores a picture."""
 COLUMNS = {
-    "subset": (pa.string(), "task/level/distractor, the subset's folder without .zarr"),
-    "episode": (pa.int64(), "index in the subset"),
-    "return": (pa.float64(), "sum of the episode's rewards"),
-    "length": (pa.int32(), "steps"),
-    "seed": (pa.uint64(), "of the episode's random streams"),
-    "policy": (pa.string(), "the behaviour policy"),
-    "terminated": (pa.bool_(), "whether the task ended it, and not the time limit"),
-    "first_frame": (PICTURE, "the first observation's first view"),
+    "subset": ("string", "task/level/distractor, the subset's folder without .zarr"),
+    "episode": ("int64", "index in the subset"),
+    "return": ("float64", "sum of the episode's rewards"),
+    "length": ("int32", "steps"),
+    "seed": ("uint64", "of the episode's random streams"),
+    "policy": ("string", "the behaviour policy"),
+    "terminated": ("bool", "whether the task ended it, and not the time limit"),
+    "first_frame": ("image", "the first observation's first view"),
 }
-"""Column -> (type, meaning)."""
+"""Column -> (type as `datasets` names it, meaning)."""
 
 
 def write_table(release: Release, path: Path) -> None:
@@ -51,7 +50,10 @@ def write_table(release: Release, path: Path) -> None:
     Raises:
       StoreError: something cannot be read or written.
     """
-    with pq.ParquetWriter(path, _schema(), compression="zstd") as writer:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with parquet.ParquetWriter(path, _schema(), compression="zstd") as writer:
         for subset in release.subsets.values():
             for first in range(0, len(subset.episodes), ROWS):
                 few = subset.episodes[first : first + ROWS]
@@ -60,25 +62,26 @@ def write_table(release: Release, path: Path) -> None:
 
 def table_rows(path: Path) -> set[tuple]:
     """The rows of a table without the pictures; none if there is no table that can be read."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
     try:
-        table = pq.read_table(path, columns=[name for name in COLUMNS if name != "first_frame"])
+        table = parquet.read_table(path, columns=[name for name in COLUMNS if name != "first_frame"])
     except (pa.ArrowInvalid, OSError, KeyError):
         return set()
     return {tuple(row.values()) for row in table.to_pylist()}
 
 
-def _dtype(kind: pa.DataType) -> str:
-    """A type as `datasets` names it."""
-    return "image" if kind == PICTURE else {"double": "float64"}.get(str(kind), str(kind))
-
-
 def _schema() -> pa.Schema:
+    import pyarrow as pa
+
     features: dict[str, Any] = {
-        name: {"_type": "Image"} if kind == PICTURE else {"dtype": _dtype(kind), "_type": "Value"}
+        name: {"_type": "Image"} if kind == "image" else {"dtype": kind, "_type": "Value"}
         for name, (kind, _) in COLUMNS.items()
     }
-    metadata = {"huggingface": json.dumps({"info": {"features": features}})}
-    return pa.schema([(name, kind) for name, (kind, _) in COLUMNS.items()], metadata=metadata)
+    picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # as `datasets` stores one
+    fields = [(name, picture if kind == "image" else pa.type_for_alias(kind)) for name, (kind, _) in COLUMNS.items()]
+    return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": features}})})
 
 
 def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:

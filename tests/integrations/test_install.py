@@ -15,11 +15,13 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
+from dmcvb_gen.cli import main
+from dmcvb_gen.extras import EXTRAS
+
 ROOT = Path(__file__).parents[2]
 READING = ("numpy", "zarr", "numcodecs", "fsspec", "pydantic", "click", "rich", "tqdm", "filelock", "tenacity", "h5py")
 """What one who only reads, fetches and exports to HDF5 installs (each brings what it needs)."""
-HEAVY = ("torch", "stable_baselines3", "sb3_contrib")
-HEAVY += ("matplotlib", "imageio", "imageio_ffmpeg", "xarray", "pandas")
+HEAVY = {"pandas", *(module for modules in EXTRAS.values() for module in modules)}
 """What the core does without."""
 
 
@@ -146,9 +148,11 @@ main(sys.argv[1:], prog_name="dmcvb-gen")
 
     small = ["--episodes", "1", "--max-steps", "4", "--size", "16", "--level", "expert"]
     for task in ("walker-walk", "ant-maze-empty7x7"):
-        commands = (["rollout", task, *small, "--out", task], ["info", task], ["preview", task])
-        for done in [command(*asked) for asked in commands]:
+        commands = (["rollout", task, *small, "--out", task], *([name, task] for name in ("info", "preview", "verify")))
+        for done in [command(*asked) for asked in (*commands, ["view", task, "--out", f"{task}.html"])]:
             assert done.returncode == 0, done.stderr
         assert (tmp_path / task / "preview/preview.webp").exists()
+    for name in main.list_commands(None):
+        assert command(name, "--help").returncode == 0, name
     refused = command("train-behaviour", "walker-walk")
     assert refused.returncode == 2 and "pip install torch" in refused.stderr, refused.stderr
