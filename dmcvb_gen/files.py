@@ -158,11 +158,12 @@ def read_yaml(path: Path | Traversable) -> Any:
 
         def compose_mapping_node(self, anchor: Any) -> Any:
             node = super().compose_mapping_node(anchor)
-            keys = [key for key, _ in node.value]
-            for number, key in enumerate(keys):
-                again = any((key.tag, key.value) == (other.tag, other.value) for other in keys[:number])
-                if again and not key.tag.endswith(":merge"):  # what a merge brings may be given again: none is lost
+            seen = set()
+            for key, _ in node.value:
+                name = key.tag, str(key.value)
+                if name in seen and not key.tag.endswith(":merge"):  # several merges lose nothing
                     raise ValueError(f"{key.value} is given twice (line {key.start_mark.line + 1}); keep one")
+                seen.add(name)
             return node
 
     try:

@@ -1,6 +1,6 @@
 """Convert policies of other programs: a Stable-Baselines3 zip or a torch state dict.
 
-Nothing is unpickled: parameters are read by torch's weights-only loader, and of a zip's `data` its plain JSON.
+No code in them runs: torch's weights-only loader reads parameters, and of a zip's `data` only its JSON is read.
 
 ::
 

@@ -105,7 +105,7 @@ def folders_of(release: Release) -> tuple[str, ...]:
 
 
 def release_at(store: Store, release: Release) -> Release | None:
-    """What is at the place that a release goes to: itself, or one that it has grown from.
+    """Return the release at a destination: the same one, or an older one that it has grown from.
 
     Returns:
       None if nothing is there, or what an interrupted try has left.

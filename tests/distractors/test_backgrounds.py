@@ -133,7 +133,7 @@ def test_numbers_in_names_are_ordered_by_value_and_hidden_files_passed_over(tmp_
 def test_a_changed_file_is_noticed_and_an_unchanged_one_not_read_again(tmp_path):
     write_video(tmp_path / "a.webp", clip(3))
     first = load_backgrounds(tmp_path)
-    assert load_backgrounds(tmp_path) is first and not first.frames(0).flags.writeable  # nobody changes what others see
+    assert load_backgrounds(tmp_path) is first and not first.frames(0).flags.writeable  # callers share the frames
     write_video(tmp_path / "a.webp", clip(4, seed=1))
     assert load_backgrounds(tmp_path).lengths == (4,) and load_backgrounds(tmp_path).digest != first.digest
 

@@ -63,7 +63,7 @@ DAMAGE = {
     "a wild action": (put("action", (1, 7, 0), 1.5), {"actions", 1, 7}),
     "no length": (put("length", 1, 0), {"lengths", 1}),
 }
-"""What is done to the arrays, the check that finds it, the episode, and the step where that is known."""
+"""Damage to the arrays, the check that finds it, the episode, and the step if it is known."""
 
 
 @pytest.mark.parametrize("name", DAMAGE)
