@@ -16,12 +16,12 @@ from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.text import as_names, quoted
 
-SHEET_COLUMNS = 10
-"""Frames of an episode on the contact sheet, evenly spaced."""
+SHEET_COLUMNS, SHEET_EPISODES = 10, 8
+"""Frames of an episode on the contact sheet, evenly spaced, and about its episodes: it is readable on one screen."""
 VIDEO_FRAMES, VIDEO_FPS = 200, 20
 VIDEO_SIDE = 512
 """Pixels that a side of a video has at least, about."""
-LABEL_HEIGHT = 14
+LABEL_HEIGHT, LABEL_SIZE = 20, 15
 
 
 def _enlarge(frames: np.ndarray, scale: int) -> np.ndarray:
@@ -32,15 +32,15 @@ def _enlarge(frames: np.ndarray, scale: int) -> np.ndarray:
 def _label(text: str, width: int) -> np.ndarray:
     """(LABEL_HEIGHT, width, 3): a caption."""
     picture = Image.new("RGB", (width, LABEL_HEIGHT), (255, 255, 255))
-    ImageDraw.Draw(picture).text((2, 1), text, fill=(0, 0, 0))
+    ImageDraw.Draw(picture).text((2, 0), text, fill=(0, 0, 0), font=ImageFont.load_default(LABEL_SIZE))
     return np.asarray(picture)
 
 
 def _fitting(name: str, width: int) -> str:
     """Return the last parts of a subset's name that fit into a caption of that width in pixels."""
-    parts = name.split("/")
+    parts, font = name.split("/"), ImageFont.load_default(LABEL_SIZE)
     endings = ["/".join(parts[first:]) for first in range(len(parts))]
-    return next((text for text in endings if ImageFont.load_default().getlength(text) <= width), parts[-1])
+    return next((ending for ending in endings if font.getlength(ending) <= width), parts[-1])
 
 
 def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, scale: int = 2) -> np.ndarray:
@@ -90,14 +90,18 @@ def video_frames(
 
 
 def _subset_frames(subset: Subset, scale: int, frames: int, episode: int | None) -> np.ndarray:
-    """(frame, height, width, 3): the views of one episode in a grid, under the subset's name."""
+    """(frame, height, width, 3): the views of one episode in a grid, under its name, step and return so far."""
     pictures = shown(subset)
-    values = subset.episode(int(subset.episodes[0]) if episode is None else episode, pictures.arrays)
+    episode = int(subset.episodes[0]) if episode is None else episode
+    values = subset.episode(episode, [*pictures.arrays, "reward"])
+    returns = np.concatenate([[0.0], values["reward"].cumsum()])
     steps = np.minimum(np.arange(frames), len(values[pictures.arrays[0]]) - 1)
     views = [_enlarge(values[name][steps], scale) for name in pictures.arrays]
     picture = _grid(views)
-    label = _label(_fitting(subset.name, picture.shape[2]), picture.shape[2])
-    return np.concatenate([np.broadcast_to(label, (frames, *label.shape)), picture], axis=1)
+    width = picture.shape[2]
+    lines = ((_fitting(subset.name, width), f"episode {episode}  step {i}", f"return {returns[i]:.1f}") for i in steps)
+    labels = [np.concatenate([_label(text, width) for text in texts]) for texts in lines]
+    return np.concatenate([np.stack(labels), picture], axis=1)
 
 
 def _grid(videos: Sequence[np.ndarray]) -> np.ndarray:
@@ -114,14 +118,16 @@ def _grid(videos: Sequence[np.ndarray]) -> np.ndarray:
 
 
 @checked
-def write_preview(release: Location, *, only: Names = (), out: Local | None = None, episodes: Count = 4) -> list[Path]:
+def write_preview(
+    release: Location, *, only: Names = (), out: Local | None = None, episodes: Count | None = None
+) -> list[Path]:
     """Write contact_sheet.png and preview.webp of a release.
 
     Args:
       release (RELEASE): Folder of the release.
       only (PATTERN): Show only these subsets.
       out (FOLDER): Output folder. [default: RELEASE/preview]
-      episodes: Episodes per subset on the sheet; the video shows the first of each.
+      episodes: Episodes per subset on the sheet; the video shows the first of each. [default: 8 in all, at most 4]
 
     Returns:
       The files.
@@ -139,7 +145,8 @@ def write_preview(release: Location, *, only: Names = (), out: Local | None = No
         raise StoreError(f"{release} has no finished episodes with images; {cure}")
     folder = local_path(out) if out else opened.path / "preview"
     sheet, video = folder / "contact_sheet.png", folder / "preview.webp"
-    picture = Image.fromarray(contact_sheet(subsets, episodes))
+    few = episodes or max(1, min(4, SHEET_EPISODES // len(subsets)))
+    picture = Image.fromarray(contact_sheet(subsets, few))
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
         picture.save(sheet)

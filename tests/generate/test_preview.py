@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.generate.preview import LABEL_HEIGHT, VIDEO_SIDE, episode_strip, video_frames
+from dmcvb_gen.generate.preview import LABEL_HEIGHT, VIDEO_SIDE, episode_strip, video_frames, write_preview
 
 
 @pytest.mark.parametrize("release", ["small_release", "maze_release"])
@@ -18,8 +19,15 @@ def test_the_video_has_some_512_pixels_a_side_and_shows_the_stored_frames(releas
     stored = subset.episode(int(subset.episodes[0]), [array])[array][1]
     columns = 1 if release == "small_release" else 3  # four views: three in a row
     scale = video.shape[2] // (columns * stored.shape[1])
-    first = video[1, LABEL_HEIGHT:, : stored.shape[1] * scale][: stored.shape[0] * scale]
+    first = video[1, 3 * LABEL_HEIGHT :, : stored.shape[1] * scale][: stored.shape[0] * scale]
     np.testing.assert_array_equal(first[::scale, ::scale], stored)
+    place, earned = video[:, LABEL_HEIGHT : 2 * LABEL_HEIGHT], video[:, 2 * LABEL_HEIGHT : 3 * LABEL_HEIGHT]
+    assert (place[0] != place[1]).any() and place.min() < 60 and earned.min() < 60  # the step, the return so far
+
+
+def test_a_sheet_of_many_subsets_fits_on_a_screen(small_release, tmp_path):
+    sheet, _ = write_preview(small_release, out=tmp_path)
+    assert len(Release.open(small_release).subsets) == 3 and Image.open(sheet).height == 6 * (LABEL_HEIGHT + 32)
 
 
 def test_each_row_of_a_maze_has_a_label_above_it(maze_release, small_release):
