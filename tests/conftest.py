@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import functools
+import json
 import os
+import subprocess
+import sys
 
 os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linux-gnu/libEGL.so.1") else "disable")
 
@@ -30,21 +33,9 @@ textures._packed_levels = functools.lru_cache(maxsize=64)(textures._packed_level
 
 def small_recipe(**changes):
     """Walker, random actions, three settings, 3 episodes in shards of 2, small pictures."""
-    fields = {
-        "name": "small",
-        "seed": 3,
-        "size": 16,
-        "renderer": {"backend": "native"},
-        "subsets": [
-            {
-                "tasks": "walker-walk",
-                "levels": "random",
-                "settings": ["none", "static", "dynamic"],
-                "episodes": 3,
-                "episodes_per_shard": 2,
-            }
-        ],
-    }
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "static", "dynamic"]}
+    subsets = [pattern | {"episodes": 3, "episodes_per_shard": 2}]
+    fields = {"name": "small", "seed": 3, "size": 16, "renderer": {"backend": "native"}, "subsets": subsets}
     return make_recipe(fields | changes)
 
 
@@ -70,8 +61,7 @@ TINY_MAZE = "ant-maze-tiny:****/*..*/****"
 def maze_recipe(settings=("visible",), **changes):
     """A maze of two cells, random actions, 2 episodes in shards of 1, small pictures."""
     pattern = {"tasks": TINY_MAZE, "levels": "random", "settings": list(settings), "episodes": 2}
-    fields = {"name": "mazes", "size": 16, "renderer": {"backend": "native"}}
-    return make_recipe(fields | {"subsets": [pattern | {"episodes_per_shard": 1} | changes]})
+    return small_recipe(name="mazes", seed=0, subsets=[pattern | {"episodes_per_shard": 1} | changes])
 
 
 @pytest.fixture(scope="session")
@@ -106,8 +96,26 @@ def small_mazes(tmp_path_factory):
 def invoke(*words, code=None):
     """Run a command of dmcvb-gen in this process, and give its result; `code` is what it must end with."""
     result = CliRunner().invoke(main, [str(word) for word in words])
-    assert code in (None, result.exit_code), result.output
+    assert code in (None, result.exit_code), (words, result.output)
     return result
+
+
+def run(*words):
+    """What a command of dmcvb-gen prints, which must succeed."""
+    return invoke(*words, code=0).stdout
+
+
+def told(*words, code=0):
+    """The facts that a command prints as JSON, which has no NaN."""
+    return json.loads(invoke(*words, "--json", code=code).stdout, parse_constant=pytest.fail)
+
+
+def python(source, *words, code=0, **options):
+    """Run Python code in a process of its own, and give what it ended with; `code` is its exit code."""
+    command = [sys.executable, "-c", source, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, **options)
+    assert code in (None, done.returncode), (words, done.stdout, done.stderr)
+    return done
 
 
 def wrong_files(folder):

@@ -13,12 +13,11 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.registry import Registry
+from tests.conftest import invoke, run
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "docs" / "examples" / "extending"
@@ -33,12 +32,6 @@ def load(name: str):
         sys.modules[module] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(sys.modules[module])
     return sys.modules[module]
-
-
-def run(*arguments) -> str:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
@@ -61,8 +54,8 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path, monke
     assert "Every material has the same grey" in (tmp_path / "r" / "README.md").read_text()
     for gone, told in (("", "unknown distractor 'grey'"), ("gone_file:Grey", "cannot find distractor gone_file:Grey")):
         monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", gone)
-        result = CliRunner().invoke(main, ["verify", str(tmp_path / "r")])
-        assert result.exit_code == 3 and "NOT CHECKED" in result.output and told in result.output, result.output
+        output = invoke("verify", tmp_path / "r", code=3).output
+        assert "NOT CHECKED" in output and told in output, output
 
 
 @pytest.mark.slow_cases("small_mazes", "small_release")
@@ -82,11 +75,6 @@ def test_a_modality_of_your_own_is_stored_exported_and_observed(family, request,
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation) and set(np.unique(observation["near"])) <= {0, 1}
     env.close()
-
-
-def validated(release, tmp_path, *options) -> dict:
-    run("validate", release, "--profile", "smoke", "--workers", "1", "--out", tmp_path / "report", *options)
-    return json.loads((tmp_path / "report" / "report.json").read_text())
 
 
 @pytest.mark.slow_cases("small_mazes-*/visible", "small_release-*/none")
@@ -120,7 +108,9 @@ def test_a_plugin_that_cannot_be_imported_is_told_in_one_line(text, told, tmp_pa
 @pytest.mark.parametrize("family", ["small_release", "small_mazes"])
 def test_a_benchmark_of_your_own_has_its_table_in_the_report(family, request, tmp_path):
     load("benchmark")
-    report = validated(request.getfixturevalue(family), tmp_path, "--benchmark", "growth")
+    words = ["--profile", "smoke", "--workers", 1, "--benchmark", "growth", "--out", tmp_path / "report"]
+    run("validate", request.getfixturevalue(family), *words)
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert {result["labels"]["policy"].split()[-1] for result in report["results"]} >= {"random"}
     assert {result["reference"] for result in report["results"]} == {"the same agent on all episodes"}
     assert "Growth: scores over shares of the data" in (tmp_path / "report" / "report.html").read_text()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.metadata
 import re
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from dmcvb_gen.extras import EXTRAS, SIMULATOR, install_hint
+from tests.test_house import imported
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -21,13 +21,7 @@ LIBRARIES_OF = importlib.metadata.packages_distributions()
 
 def imported_modules() -> set[str]:
     """Top modules of other packages that some module of the package imports, at its top or within a function."""
-    found = set()
-    for path in (ROOT / "dmcvb_gen").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                found |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                found.add(node.module.split(".")[0])
+    found = {name.split(".")[0] for path in (ROOT / "dmcvb_gen").rglob("*.py") for name in imported(path)}
     return found - set(sys.stdlib_module_names) - {"dmcvb_gen", "__future__"}
 
 

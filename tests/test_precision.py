@@ -6,11 +6,10 @@ from functools import partial
 
 import pytest
 import torch
-from click.testing import CliRunner
 
 from dmcvb_gen import precision
-from dmcvb_gen.cli import main
 from dmcvb_gen.training.run import read_config
+from tests.conftest import invoke
 
 SMALL = ("warmup_steps=8", "simulations=4", "batch_size=8", "compile=false")
 SHORT = ["--steps=12", *(f"--set={pair}" for pair in SMALL)]
@@ -47,7 +46,6 @@ def test_a_gpu_that_emulates_bfloat16_computes_in_float32(monkeypatch, native):
 @pytest.mark.parametrize("fast", ["float32", "bfloat16"])
 def test_a_run_says_and_records_what_auto_chose(tmp_path, monkeypatch, fast):
     monkeypatch.setattr(precision, "choose_precision", lambda *arguments: fast)
-    run = CliRunner().invoke(main, ["train-behaviour", "walker-walk", "--out", str(tmp_path / "run"), *SHORT])
-    assert run.exit_code == 0, run.output
+    run = invoke("train-behaviour", "walker-walk", "--out", tmp_path / "run", *SHORT, code=0)
     assert f", {fast}: " in run.stderr
     assert read_config(tmp_path / "run").settings["bfloat16"] == (fast == "bfloat16")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import signal
-import subprocess
 import sys
 
 import imageio.v3 as imageio
@@ -20,7 +18,7 @@ from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.training.settings import ALGORITHMS, settings_class
-from tests.conftest import invoke
+from tests.conftest import invoke, python, told
 
 SMALL = ["rollout", "walker-walk", "--size", "16"]
 TINY = [*SMALL, "--max-steps", "4", "--episodes", "2"]
@@ -28,10 +26,6 @@ TINY = [*SMALL, "--max-steps", "4", "--episodes", "2"]
 
 def said(*words, code=0):
     return invoke(*words, code=code).output
-
-
-def told(*words, code=0):
-    return json.loads(invoke(*words, "--json", code=code).stdout, parse_constant=pytest.fail)
 
 
 @pytest.mark.slow
@@ -126,8 +120,8 @@ main(["verify", "."])
 
 
 def test_nothing_that_was_half_begun_prints_a_traceback_when_a_command_is_stopped():
-    ended = subprocess.run([sys.executable, "-c", HALF_BEGUN], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr.strip()) == (INTERRUPTED, "", "Interrupted.")
+    ended = python(HALF_BEGUN, code=INTERRUPTED)
+    assert (ended.stdout, ended.stderr.strip()) == ("", "Interrupted.")
 
 
 # -- what silence would cost ----------------------------------------------------------------------
@@ -231,5 +225,5 @@ def test_a_damaged_chunk_is_one_line_in_python(tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
-    read = subprocess.run([sys.executable, "-c", READ, str(tmp_path / "r")], capture_output=True, text=True, check=True)
+    read = python(READ, tmp_path / "r")
     assert read.stdout.startswith("caught") and "Stored:" not in read.stdout and read.stderr == ""

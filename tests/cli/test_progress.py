@@ -3,14 +3,13 @@
 import re
 
 import pytest
-from click.testing import CliRunner
 
 from dmcvb_gen import progress
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, start
 from dmcvb_gen.generate.recipe import make_recipe
+from tests.conftest import invoke, run
 
 LINE = re.compile(r"^(.+: )? *\d+%\| (?P<done>\S+)/(?P<all>\S+) \[[\d:]+<[\d:?]+, .+/ ?\S+(, .+)?\]$")
 TASKS = ("walker-walk", "ant-maze-empty7x7")
@@ -33,22 +32,12 @@ def commands(task, folder):
     yield "publish", folder / "exported", f"file:{folder / 'published-export'}"
 
 
-def invoke(words):
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
-def errors_of(words):
-    result = invoke(words)
-    assert result.exit_code == 0, (words, result.output)
-    return result.stderr
-
-
 @pytest.mark.slow_cases("ant-maze-empty7x7", "walker-walk")
 @pytest.mark.parametrize("task", TASKS)
 def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, task):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0)
     for words in commands(task, tmp_path):
-        told = errors_of(words)
+        told = invoke(*words, code=0).stderr
         unknown = re.compile(r"\| 0(\.00)?/\? ")  # of a bar that was not told yet, before anything is done
         shown = [line for line in told.splitlines() if ("%|" in line or "/?" in line) and not unknown.search(line)]
         lines = [LINE.match(line) for line in shown]
@@ -62,18 +51,16 @@ def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, 
 
 
 def test_a_log_gets_nothing_of_a_quick_command(small_release):
-    assert "%|" not in errors_of(["verify", small_release])
+    assert "%|" not in invoke("verify", small_release, code=0).stderr
 
 
 @pytest.mark.slow_cases("ant-maze-empty7x7", "walker-walk")
 @pytest.mark.parametrize("task", TASKS)
 def test_images_and_scores_are_told_while_cells_train(tmp_path, monkeypatch, task):
     monkeypatch.setattr(progress, "LOG_SECONDS", 0)
-    release, report = str(tmp_path / "made"), str(tmp_path / "report")
-    made = ["rollout", task, "--episodes", "4", "--max-steps", "12", "--no-pixels", "--out", release]
-    assert invoke(made).exit_code == 0
-    asked = ["--profile", "smoke", "--agents", "bc,state-bc", "--train-unsound", "--out", report]
-    told = invoke(["validate", release, *asked]).output.splitlines()
+    run("rollout", task, "--episodes", 4, "--max-steps", 12, "--no-pixels", "--out", tmp_path / "made")
+    asked = ["--profile", "smoke", "--agents", "bc,state-bc", "--train-unsound", "--out", tmp_path / "report"]
+    told = invoke("validate", tmp_path / "made", *asked).output.splitlines()
     scores = [place for place, line in enumerate(told) if "[smoke]" in line]
     training = [place for place, line in enumerate(told) if re.match(r".*bc.*%\|", line)]
     assert len(scores) == 2 and scores[0] < max(training), told

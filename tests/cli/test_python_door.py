@@ -11,6 +11,7 @@ import pytest
 import dmcvb_gen
 from dmcvb_gen.cli import COMMANDS, main
 from dmcvb_gen.dataset.gate import Release
+from tests.conftest import run
 
 FUNCTIONS = ("rollout", "paint", "repaint", "regenerate", "verify", "publish", "fetch", "export", "validate")
 FUNCTIONS += ("train_behaviour", "evaluate_behaviour")
@@ -39,10 +40,8 @@ def test_a_command_has_the_options_of_its_function(name):
 
 
 def test_the_command_line_makes_the_same_bytes(tmp_path):
-    from click.testing import CliRunner
-
     words = "rollout walker-walk --level expert --distractor dynamic --episodes 1 --max-steps 5 --size 16 --out"
-    assert CliRunner().invoke(main, [*words.split(), str(tmp_path / "cli")]).exit_code == 0
+    run(*words.split(), tmp_path / "cli")
     given = dict(levels="expert", distractors="dynamic", episodes=1, max_steps=5, size=16, progress=False)
     made = dmcvb_gen.rollout("walker-walk", out=tmp_path / "python", **given)
     assert made.digest == Release.open(tmp_path / "cli").digest

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import pytest
 
 from dmcvb_gen.parallel import cores
+from tests.conftest import python
 
 
 @pytest.mark.parametrize("limit, wanted", [("max 100000", 6), ("150000 100000", 2), ("50000 100000", 1), ("", 6)])
@@ -31,4 +30,4 @@ def test_a_system_without_affinities_gives_all_cores(tmp_path, monkeypatch):
 def test_a_process_that_is_pinned_to_one_core_counts_one():
     code = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])\n"
     code += "from dmcvb_gen.parallel.cores import usable_cores; print(usable_cores())"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "1\n"
+    assert python(code).stdout == "1\n"

@@ -39,6 +39,18 @@ def die(number, tick):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def wait(done, seconds=60):
+    """Wait until something is true, and say if it is."""
+    deadline = time.time() + seconds
+    while not done() and time.time() < deadline:
+        time.sleep(0.05)
+    return done()
+
+
+def ended(pids):
+    return not any(os.path.exists(f"/proc/{pid}") for pid in pids)
+
+
 def threads(number, tick):
     import torch
 
@@ -103,10 +115,7 @@ def test_what_is_handed_out_is_bounded():
 def test_workers_have_the_threads_that_they_were_given_and_end_with_the_pool():
     found = in_order(threads, [1, 2], 2)
     assert {count for count, _ in found} == {1}
-    deadline = time.time() + 20
-    while any(os.path.exists(f"/proc/{pid}") for _, pid in found) and time.time() < deadline:
-        time.sleep(0.05)
-    assert not any(os.path.exists(f"/proc/{pid}") for _, pid in found)
+    assert wait(lambda: ended(pid for _, pid in found))
 
 
 PARENT = """
@@ -127,16 +136,10 @@ def test_workers_end_when_their_parent_was_killed(tmp_path):
     pids = tmp_path / "pids"
     pids.mkdir()
     parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py"), str(pids)])
-    deadline = time.time() + 60
-    while len(list(pids.iterdir())) < 2 and time.time() < deadline:
-        time.sleep(0.05)
-    workers = [path.name for path in pids.iterdir()]
-    assert len(workers) == 2
+    assert wait(lambda: len(list(pids.iterdir())) == 2)
     parent.kill()
     parent.wait()
-    while any(os.path.exists(f"/proc/{pid}") for pid in workers) and time.time() < deadline:
-        time.sleep(0.05)
-    assert not any(os.path.exists(f"/proc/{pid}") for pid in workers)
+    assert wait(lambda: ended(path.name for path in pids.iterdir()))
 
 
 GUARDLESS = """
