@@ -198,6 +198,7 @@ def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Seq
         summary=summary,
         limits=limits,
         header=header(manifest, facts["steps"]),
+        step=_held(manifest),
         arrays=_arrays(release),
         statistics=STATISTICS,
         successes={s.name: float(s.read("terminated").mean()) for s in release.subsets.values() if s.record.goal_mode},
@@ -212,6 +213,14 @@ def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Seq
         citation=CITATION,
     )
     return re.sub(r"\n{3,}", "\n\n", text)
+
+
+HELD = {1: "one control step", 2: "two control steps", 4: "four control steps"}
+
+
+def _held(manifest: Manifest | Resolved) -> str:
+    """The control steps for which an action is held, in words."""
+    return " or ".join(HELD[repeat] for repeat in sorted({record.action_repeat for record in manifest.subsets}))
 
 
 def _arrays(release: Release) -> dict[tuple, list[str]]:
@@ -300,10 +309,8 @@ def _limits(release: Release) -> list[str]:
     if algorithms := {str(policy.header.get("algorithm", "unknown means")) for policy in policies} - {OWN_CODE}:
         how = " and ".join(origin_of(name) for name in sorted(algorithms))
         limits.append(f"Behaviour policies were trained {how}; the paper's by MPO.")
-    repeats = sorted({record.action_repeat for record in manifest.subsets})
-    if repeats != [ACTION_REPEAT]:
-        held = " or ".join(map(str, repeats))
-        limits.append(f"An action is held for {held} control steps, in DMC-VB for {ACTION_REPEAT}.")
+    if (held := _held(manifest)) != HELD[ACTION_REPEAT]:
+        limits.append(f"An action is held for {held}, in DMC-VB for {HELD[ACTION_REPEAT]}.")
     if release.manifest.imported:
         limits.append("Imported data have no physics states and no labels, so nothing can be rendered from them.")
     else:

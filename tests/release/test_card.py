@@ -174,6 +174,16 @@ def test_longer_episodes_are_not_compared_with_the_papers(tmp_path):
     assert "| DMC-VB paper |" in text and "(z = " not in text
 
 
+@pytest.mark.parametrize("repeat, held", [(1, "one control step"), (2, "two control steps"), (4, "four control steps")])
+def test_the_control_steps_of_a_step_are_the_recipes(repeat, held, tmp_path):
+    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 2}
+    roll_out(small_recipe(subsets=[pattern], size=8, action_repeat=repeat), tmp_path / "r")
+    write_card(tmp_path / "r")
+    text = (tmp_path / "r/README.md").read_text()
+    assert f"A step is {held} with the same action." in text
+    assert (f"An action is held for {held}, in DMC-VB for two control steps." in text) == (repeat != 2)
+
+
 def test_a_card_replaces_no_other_readme_and_needs_a_release(carded, tmp_path):
     with pytest.raises(StoreError, match="holds no release"):
         write_card(tmp_path)
