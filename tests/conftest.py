@@ -31,18 +31,19 @@ pytest_plugins = ["tests.compiled_code", "tests.tiers"]
 textures._packed_levels = functools.lru_cache(maxsize=64)(textures._packed_levels.__wrapped__)
 
 
+WALKERS = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "static", "dynamic"]}
+WALKERS |= {"episodes": 3, "episodes_per_shard": 2}
+
+
 def small_recipe(**changes):
     """Walker, random actions, three settings, 3 episodes in shards of 2, small pictures."""
-    pattern = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "static", "dynamic"]}
-    subsets = [pattern | {"episodes": 3, "episodes_per_shard": 2}]
-    fields = {"name": "small", "seed": 3, "size": 16, "renderer": {"backend": "native"}, "subsets": subsets}
+    fields = {"name": "small", "seed": 3, "size": 16, "renderer": {"backend": "native"}, "subsets": [WALKERS]}
     return make_recipe(fields | changes)
 
 
 def short_recipe(**changes):
     """As `small_recipe`, with episodes of 20 steps; `changes` are of the subsets."""
-    [pattern] = small_recipe().model_dump(mode="json")["subsets"]
-    return small_recipe(subsets=[pattern | {"max_steps": 20} | changes])
+    return small_recipe(subsets=[WALKERS | {"max_steps": 20} | changes])
 
 
 def roll_out(recipe, folder, works=lambda works: works, workers=1, only=(), pixels=True):

@@ -46,11 +46,7 @@ def digests(task_id: str, steps: int, renderer: str | None) -> dict[str, str]:
     found["action at the start"] = digest(policy.act(batch.behaviour_observation(), deterministic=True))
     physics = np.repeat(start[:, None], steps + 1, axis=1)
     for setting in ("none", "dynamic") if task.family == LOCOMOTION else ("visible",):
-        streams = {
-            name: [episode_stream(0, names, i, name) for i in episodes]
-            for name in STREAMS
-            if name not in ("initial_state", "policy")
-        }
+        streams = {name: [episode_stream(0, names, i, name) for i in episodes] for name in STREAMS}
         distractors = parse_setting(task_id, setting)[0]
         backgrounds = load_backgrounds("builtin", "train") if distractors.kind != "none" else None
         labels = sample_distractors(task, distractors, physics, streams, backgrounds, split="train")

@@ -1,4 +1,4 @@
-"""README and docs: the blocks of all pages run as a reader runs them, and the site builds without a warning.
+"""README and docs: pages and notebook run as a reader runs them, and the site builds without a warning.
 
 Pages run in the order of the site, in one folder, with one bucket. A single page runs too: `-k light`.
 """
@@ -80,6 +80,22 @@ def test_every_block_of_a_page_runs_after_the_pages_before_it(page, reader):
         assert done.returncode == 0, told
 
 
+@pytest.mark.full
+def test_the_notebook_runs_and_its_cloned_policy_beats_the_random_one(tmp_path, monkeypatch):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    notebook = nbformat.read(ROOT / "docs/examples/tour.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells), "the notebook is stored without outputs"
+    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    printed = "".join(out.get("text", "") for cell in notebook.cells for out in cell.get("outputs", []))
+    assert (tmp_path / "releases/tour/preview/viewer.html").is_file()
+    returns = {name: float(value) for name, value in re.findall(r"^(\w+): return (-?\d+)", printed, re.MULTILINE)}
+    assert returns["cloned"] > 2 * returns["random"] > 0, printed
+    pictures = [out for cell in notebook.cells for out in cell.get("outputs", []) if "image/png" in out.get("data", {})]
+    assert len(pictures) == 1
+
+
 def test_every_page_is_in_the_site():
     assert {page.stem for page in PAGES} == {"README", *(path.stem for path in (ROOT / "docs").glob("*.md"))}
 
@@ -102,21 +118,19 @@ def test_a_page_has_layouts_set_up_and_files_of_the_repository_beside_what_it_ru
             assert block.code == SNIPPET.format(block.file) and (ROOT / block.file).is_file(), where
 
 
-def test_the_pages_show_every_example():
+def test_the_pages_show_every_example_which_is_short():
     shown = {block.file for page in PAGES for block in blocks(page) if block.file}
     assert shown == {str(path.relative_to(ROOT)) for path in (ROOT / "docs/examples").rglob("*.py")}
+    lines = {name: len((ROOT / name).read_text().splitlines()) for name in shown}
+    assert not [name for name in shown if lines[name] > (30 if "/extending/" in name else 55)]
 
 
 @pytest.mark.full
 def test_the_site_builds_without_a_warning_and_shows_every_command(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
     site = tmp_path / "site"
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
     assert not [path for path in site.rglob("*") if path.stat().st_size > 2_000_000]
     assert "class LinearBC" in re.sub("<[^>]+>", "", (site / "extending/index.html").read_text())  # files are included
     pages = {path.parent.name: path.read_text() for path in (site / "cli").rglob("index.html")}
@@ -129,8 +143,7 @@ def test_the_site_builds_without_a_warning_and_shows_every_command(tmp_path):
 
 def test_links_and_pictures_work_in_the_repository():
     """Readers of the repository find all but the commands' own pages, which are made of the code."""
-    cards = [ROOT / "dataset_cards/README.md"]
-    for page in [*PAGES, ROOT / "CONTRIBUTING.md", *cards]:
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "dataset_cards/README.md"]:
         targets = re.findall(r"!?\[[^\]]*\]\(([^)\s#]+)", BLOCK.sub("", page.read_text()))
         made = [target for target in targets if target.startswith(("http", "cli/"))]
         for target in set(targets) - set(made):

@@ -35,10 +35,7 @@ def test_the_processors_flags_decide(tmp_path, monkeypatch, flags, chosen):
 
 @pytest.mark.parametrize("native", [True, False])
 def test_a_gpu_that_emulates_bfloat16_computes_in_float32(monkeypatch, native):
-    def supported(including_emulation=True):
-        return including_emulation or native
-
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: including_emulation or native)
     assert precision.choose_precision("auto", "cuda") == ("bfloat16" if native else "float32")
 
 

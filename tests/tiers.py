@@ -10,14 +10,10 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-import dmcvb_gen
-
-COMPILED = [Path(dmcvb_gen.__file__).parent / room / "__pycache__" for room in ("rendering/native", "policies")]
-"""Folders of numba's compiled code. A test in which they change has compiled for all others, and is not judged."""
+from tests.compiled_code import ROOMS
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -32,8 +28,11 @@ def processor_seconds() -> float:
 
 
 def compiled() -> set[tuple[str, int]]:
-    """Files of compiled code, with the time of their last change."""
-    return {(str(path), path.stat().st_mtime_ns) for folder in COMPILED for path in folder.glob("*.nb?")}
+    """Files of numba's compiled code, with the time of their last change.
+
+    A test in which they change has compiled for all others, and is not judged.
+    """
+    return {(str(path), path.stat().st_mtime_ns) for room in ROOMS for path in room.glob("__pycache__/*.nb?")}
 
 
 @pytest.hookimpl(tryfirst=True)

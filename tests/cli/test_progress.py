@@ -1,6 +1,7 @@
 """Progress: a bar on a terminal and rare lines in a log, that know how much is to come; for both families."""
 
 import re
+from unittest.mock import Mock
 
 import pytest
 
@@ -69,23 +70,15 @@ def test_images_and_scores_are_told_while_cells_train(tmp_path, monkeypatch, tas
 
 def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
     """Experts are at the goal long before the time limit."""
-    told = []
-
-    class Told:
-        def __call__(self, frames):
-            told.append(("frames", frames))
-
-        def expect(self, frames):
-            told.append(("expected", frames))
-
+    told = Mock()
     fields = {"episodes": 3, "episodes_per_shard": 1}
     pattern = fields | {"tasks": "ant-maze-empty7x7", "levels": "expert", "settings": "visible"}
     plan = make_plan(make_recipe({"name": "early", "size": 16, "subsets": [pattern]}), tmp_path / "early")
     start(plan)
-    list(run_works(plan.works, 1, Told()))
+    list(run_works(plan.works, 1, told))
     subset = Release.open(tmp_path / "early")["ant-maze-empty7x7/expert/visible"]
-    expected = [frames for what, frames in told if what == "expected"]
-    frames = sum(frames for what, frames in told if what == "frames")
+    expected = [call.args[0] for call in told.expect.call_args_list]
+    frames = sum(call.args[0] for call in told.call_args_list)
     views = len(subset.record.views)
     assert frames == expected[-1] == views * (subset.steps + 3) < expected[0] == views * 3 * 601
     first = subset.read("length", [0])[0] + 1

@@ -23,11 +23,12 @@ def clip(frames=3, height=40, width=60, seed=0):
 
 def write_video(path, frames):
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".mp4":
-        iio.imwrite(path, frames, plugin="FFMPEG", fps=12, macro_block_size=2)
-        return
-    pictures = [Image.fromarray(frame) for frame in frames]
-    pictures[0].save(path, save_all=True, append_images=pictures[1:])
+    if path.suffix in (".gif", ".webp"):
+        pictures = [Image.fromarray(frame) for frame in frames]
+        pictures[0].save(path, save_all=True, append_images=pictures[1:])
+    else:  # with its index in front, where a format can have it, so that the beginning still opens
+        options = ["-movflags", "faststart"] if path.suffix == ".mp4" else []
+        iio.imwrite(path, frames, plugin="FFMPEG", fps=12, macro_block_size=2, quality=10, output_params=options)
 
 
 def write_frames(folder, frames, kind="jpg"):
@@ -99,11 +100,8 @@ def test_a_truncated_or_unreadable_file_is_named_instead_of_giving_fewer_frames(
     frames = clip(12, 128, 128)
     if suffix in (".png", ".jpg"):
         Image.fromarray(frames[0]).save(path)
-    elif suffix in (".gif", ".webp"):
+    else:
         write_video(path, frames)
-    else:  # with its index in front, where a format can have it, so that the beginning still opens
-        options = ["-movflags", "faststart"] if suffix == ".mp4" else []
-        iio.imwrite(path, frames, plugin="FFMPEG", fps=12, macro_block_size=2, output_params=options)
     assert load_backgrounds(tmp_path).lengths == (1 if suffix in (".png", ".jpg") else 12,)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)] if share else b"not a video" * 50)
@@ -114,7 +112,7 @@ def test_a_truncated_or_unreadable_file_is_named_instead_of_giving_fewer_frames(
 def test_a_video_keeps_its_colors_order_and_central_square(tmp_path):
     frames = np.zeros((5, 64, 128, 3), np.uint8)
     frames[:, :, 32:96] = [[[[40 * k, 200 - 40 * k, 90]]] for k in range(5)]
-    iio.imwrite(tmp_path / "a.mp4", frames, plugin="FFMPEG", fps=12, macro_block_size=2, quality=10)
+    write_video(tmp_path / "a.mp4", frames)
     found = load_backgrounds(tmp_path).frames(0)
     assert found.shape == (5, 256, 256, 3)
     for index in range(5):

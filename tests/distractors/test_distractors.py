@@ -10,12 +10,10 @@ from scipy.stats import ks_2samp, kstest
 from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
-from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
-
-STREAMS = ("camera", "color", "background", "style", "cue", "shake", "light")
 
 
 def physics_of(task, episodes=2, frames=41):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -14,8 +12,8 @@ from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.spec import ALL_PARTS, DistractorSetting
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.cameras import seen_materials
+from tests.conftest import run, told
 from tests.distractors.test_distractors import labels, physics_of
-from tests.test_whole_way import run
 
 
 @pytest.mark.parametrize(
@@ -120,7 +118,7 @@ def test_a_release_of_them_goes_the_whole_way(task_id, tmp_path):
     run("paint", folder)
     subsets = Release.open(folder).subsets
     assert {subset.setting for subset in subsets.values()} == SENTENCES.keys()
-    assert json.loads(run("verify", folder, "--json"))["sound"]
+    assert told("verify", folder)["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
     [lit] = [subset for subset in subsets.values() if "light" in subset.setting]
     assert lit.read("exogenous/light_shift").shape == (2, 7, 3) and lit.labels().light_shift.any()
@@ -164,7 +162,7 @@ def test_the_cue_in_the_data_correlates_with_the_action_as_asked(task_id, rho, t
     cue, action = cue_and_action(subset)
     assert len(cue) == 2000 and set(np.unique(cue)) == {-1.0, 1.0}
     assert abs(np.corrcoef(cue, action)[0, 1] - rho) < 4 / np.sqrt(2000)
-    assert json.loads(run("verify", folder, "--json"))["sound"]
+    assert told("verify", folder)["sound"]
     assert "same digest" in run("regenerate", folder, "--check")
 
 

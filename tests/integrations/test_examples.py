@@ -10,10 +10,9 @@ from pathlib import Path
 import grain
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import dmcvb_gen
-from dmcvb_gen.cli import main
+from tests.conftest import run
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "docs/examples").glob("bc_*.py"))
 SUBSETS = {
@@ -26,17 +25,15 @@ SUBSETS = {
 def releases(tmp_path_factory):
     """Name of a subset -> the folder of its release, of two short episodes."""
     folder = tmp_path_factory.mktemp("examples")
-    small = ["--level", "expert", "--episodes", "2", "--max-steps", "20", "--size", "16"]
+    small = ["--level", "expert", "--episodes", 2, "--max-steps", 20, "--size", 16]
     for name, asked in SUBSETS.items():
-        done = CliRunner().invoke(main, ["rollout", *asked, *small, "--out", str(folder / name)])
-        assert done.exit_code == 0, done.output
+        run("rollout", *asked, *small, "--out", folder / name)
     return {name: str(folder / name) for name in SUBSETS}
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_short_and_learns_its_data(example, releases):
-    assert len(example.read_text().splitlines()) < 55
+def test_an_example_learns_its_data(example, releases):
     for name in SUBSETS:
         asked = [sys.executable, str(example), releases[name], name]
         done = subprocess.run(asked, capture_output=True, text=True)

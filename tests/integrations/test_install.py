@@ -7,16 +7,18 @@ import subprocess
 import sys
 import sysconfig
 import zipfile
-from importlib.metadata import distributions
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.extras import EXTRAS
+from tests.conftest import python
 
 ROOT = Path(__file__).parents[2]
 READING = ("numpy", "zarr", "numcodecs", "fsspec", "pydantic", "click", "rich", "tqdm", "filelock", "tenacity", "h5py")
@@ -34,21 +36,11 @@ def wheel(tmp_path_factory):
     return next(folder.glob("dmcvb_gen-*.whl"))
 
 
-@pytest.fixture(scope="module")
-def release(tmp_path_factory):
-    out = tmp_path_factory.mktemp("data") / "demo"
-    asked = ["walker-walk", "--level", "random", "--episodes", "2", "--max-steps", "5", "--size", "16"]
-    subprocess.run(
-        [sys.executable, "-m", "dmcvb_gen", "rollout", *asked, "--out", str(out)], check=True, cwd=out.parent
-    )
-    return out
-
-
 def test_the_pinned_versions_are_for_every_python_3_11():
     """One that wants a later patch than the system's has the installer search without end for another way."""
     pins = (ROOT / "scripts" / "constraints.txt").read_text().splitlines()[1:]
     pinned = {canonicalize_name(name): version for name, _, version in (pin.partition("==") for pin in pins)}
-    named = ((found, pinned.get(canonicalize_name(found.metadata["Name"]))) for found in distributions())
+    named = ((found, pinned.get(canonicalize_name(found.metadata["Name"]))) for found in metadata.distributions())
     here = [found for found, version in named if version and Version(found.version).public == version]
     assert len(here) > 100, "the tests' machine is not set up by scripts/setup.sh"
     too_new = {found.name: found.metadata["Requires-Python"] for found in here}
@@ -66,27 +58,18 @@ def test_the_wheel_is_small_and_carries_every_data_file(wheel):
 
 def closure(packages):
     """Packages and what they need, of those installed here."""
-    from importlib import metadata
-
-    import packaging.requirements
-
     found, todo = set(), list(packages)
     while todo:
-        name = todo.pop().lower().replace("_", "-")
-        if name in found:
-            continue
-        found.add(name)
-        for text in metadata.requires(name) or ():
-            need = packaging.requirements.Requirement(text)
-            if need.marker is None or need.marker.evaluate({"extra": ""}):
-                todo.append(need.name)
+        name = canonicalize_name(todo.pop())
+        if name not in found:
+            found.add(name)
+            needs = map(Requirement, metadata.requires(name) or ())
+            todo += [need.name for need in needs if need.marker is None or need.marker.evaluate({"extra": ""})]
     return found
 
 
 def site_of(packages, wheel, folder):
     """A folder with nothing but the wheel and links to these packages and what they need."""
-    from importlib import metadata
-
     zipfile.ZipFile(wheel).extractall(folder)
     library = Path(sysconfig.get_paths()["purelib"])
     for name in closure(packages):
@@ -109,17 +92,17 @@ def run(site, *arguments):
 
 
 @pytest.mark.slow
-def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
+def test_reading_needs_next_to_nothing(wheel, small_release, tmp_path):
     site = site_of(READING, wheel, tmp_path / "site")
     assert not (site / "mujoco").exists() and not (site / "torch").exists() and not (site / "gymnasium").exists()
     for command in (
         ["--help"],
-        ["info", release],
-        ["verify", release],
-        ["publish", release, f"file:{tmp_path / 'published'}"],
+        ["info", small_release],
+        ["verify", small_release],
+        ["publish", small_release, f"file:{tmp_path / 'published'}"],
         ["fetch", f"file:{tmp_path / 'published'}", "--out", tmp_path / "fetched"],
         ["info", f"file:{tmp_path / 'published'}"],
-        ["export", release, "--to", "hdf5", "--out", tmp_path / "h5"],
+        ["export", small_release, "--to", "hdf5", "--out", tmp_path / "h5"],
     ):
         done = run(site, *command)
         assert done.returncode == 0, (command, done.stdout, done.stderr)
@@ -129,7 +112,7 @@ def test_reading_needs_next_to_nothing(wheel, release, tmp_path):
 
 @pytest.mark.slow
 def test_the_core_makes_and_shows_data_without_any_extra(tmp_path):
-    code = f"""
+    source = f"""
 import sys
 
 class Missing:
@@ -142,17 +125,16 @@ from dmcvb_gen.cli import main
 main(sys.argv[1:], prog_name="dmcvb-gen")
 """
 
-    def command(*arguments):
-        asked = [sys.executable, "-c", code, *map(str, arguments)]
-        return subprocess.run(asked, capture_output=True, text=True, cwd=tmp_path)
+    def command(*words, code=0):
+        return python(source, *words, code=code, cwd=tmp_path)
 
     small = ["--episodes", "1", "--max-steps", "4", "--size", "16", "--level", "expert"]
     for task in ("walker-walk", "ant-maze-empty7x7"):
-        commands = (["rollout", task, *small, "--out", task], *([name, task] for name in ("info", "preview", "verify")))
-        for done in [command(*asked) for asked in (*commands, ["view", task, "--out", f"{task}.html"])]:
-            assert done.returncode == 0, done.stderr
+        command("rollout", task, *small, "--out", task)
+        for name in ("info", "preview", "verify"):
+            command(name, task)
+        command("view", task, "--out", f"{task}.html")
         assert (tmp_path / task / "preview/preview.webp").exists()
     for name in main.list_commands(None):
-        assert command(name, "--help").returncode == 0, name
-    refused = command("train-behaviour", "walker-walk")
-    assert refused.returncode == 2 and "pip install torch" in refused.stderr, refused.stderr
+        command(name, "--help")
+    assert "pip install torch" in command("train-behaviour", "walker-walk", code=2).stderr

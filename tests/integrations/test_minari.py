@@ -6,7 +6,6 @@ import minari
 import numpy as np
 import pytest
 from minari.cli import app
-from PIL import Image
 from typer.testing import CliRunner as TyperRunner
 
 import dmcvb_gen
@@ -15,6 +14,7 @@ from dmcvb_gen.generate.references import reference_returns
 from dmcvb_gen.release.export import export
 from dmcvb_gen.tasks import get_task
 from tests.conftest import roll_out, small_recipe
+from tests.distractors.test_backgrounds import write_frames
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +63,8 @@ def test_environments_are_recovered_with_the_spaces_of_the_data(datasets, stored
 
 def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_given(tmp_path, monkeypatch):
     for split, grey in (("train", 10), ("val", 250)):
-        (tmp_path / "videos" / split / "one").mkdir(parents=True)
-        for frame in range(3):
-            picture = Image.fromarray(np.full((256, 256, 3), (grey, 0, 255 - grey), np.uint8))
-            picture.save(tmp_path / "videos" / split / "one" / f"{frame}.png")
+        frames = np.full((3, 256, 256, 3), (grey, 0, 255 - grey), np.uint8)
+        write_frames(tmp_path / "videos" / split / "one", frames, "png")
     pattern = {"tasks": "walker-walk", "levels": "random", "settings": "static", "episodes": 1, "max_steps": 3}
     shown = {"backgrounds": str(tmp_path / "videos"), "split": "val", "size": 32}
     recipe = small_recipe(subsets=[pattern], action_repeat=1, **shown)

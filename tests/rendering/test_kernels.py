@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from numba import njit
+from scipy import ndimage
 
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.lighting import aim_shadows, cast_shadows, lamp_on_plane
@@ -16,22 +16,6 @@ SOLIDS = """<mujoco><worldbody><geom type="sphere" size=".3" pos="-.9 .5 0"/>
 <geom type="capsule" size=".15 .3" pos="-.3 .5 0" euler="30 50 0"/><geom type="box" size=".2 .1 .3" pos=".4 .5 .1"
 euler="20 40 60"/><geom type="cylinder" size=".2 .3" pos="-.7 -.4 0" euler="70 10 0"/>
 <geom type="ellipsoid" size=".3 .1 .2" pos=".4 -.4 .2" euler="0 40 60"/></worldbody></mujoco>"""
-
-
-@njit
-def shadowed(s, n, k, rec):
-    aim_shadows(k, rec)
-    cast_shadows(s, n, k, rec, -1)
-
-
-@njit
-def sampled(s, n, texels, width):
-    sample_repeating(s, n, texels, width, 0)
-
-
-@njit
-def lit(s, n, k, rec, plane):
-    lamp_on_plane(s, n, k, rec, plane, 0)
 
 
 def rows(s, first, count=3):
@@ -55,7 +39,8 @@ def test_shadows_fall_where_mujocos_rays_are_blocked():
         s = np.zeros(L.ROWS * L.CHUNK, np.float32)
         points = rng.uniform([-1.5, -1.2, -1.0], [1.2, 1.2, -0.6], (L.CHUNK, 3))
         rows(s, L.POINT)[:], rows(s, L.LIGHT, 1)[:] = points.T, 1
-        shadowed(s, L.CHUNK, k, rec)
+        aim_shadows(k, rec)
+        cast_shadows(s, L.CHUNK, k, rec, -1)
         ways = points - lamp
         found = [mujoco.mj_ray(solids, data, lamp, way, None, 1, -1, np.zeros(1, np.int32)) for way in ways]
         blocked += [0 <= distance < 1 for distance in found]
@@ -73,31 +58,23 @@ def test_a_texture_is_a_blend_of_texels_of_the_two_nearest_levels():
     textures.make_ready(0)
     picture = noise.tex_data.reshape(16, 16, 3)
     rng, s = np.random.default_rng(0), np.zeros(L.ROWS * L.CHUNK, np.float32)
-    across, down, footprint = (
-        rng.uniform(-2, 2, L.CHUNK),
-        rng.uniform(-2, 2, L.CHUNK),
-        4.0 ** rng.uniform(0, 4, L.CHUNK),
-    )
+    (across, down), footprint = rng.uniform(-2, 2, (2, L.CHUNK)), 4.0 ** rng.uniform(0, 4, L.CHUNK)
     for row, values in ((L.S, across), (L.T, down), (L.FOOTPRINT, footprint)):
         rows(s, row, 1)[:] = values
-    sampled(s, L.CHUNK, textures.texels, textures.table.shape[1])
+    sample_repeating(s, L.CHUNK, textures.texels, textures.table.shape[1], 0)
 
-    pyramid = [level.astype(float) for level in levels(picture)]
-    for i in range(L.CHUNK):
-        power = np.floor(np.log2(footprint[i]))
-        detail = 0.5 * (power + footprint[i] / 2**power - 1) + 0.25  # linear between powers of two
-        share = np.clip(2 * (detail % 1) - 1, 0, 1)
-        colors = []
-        for level in (int(detail), int(detail) + 1):
-            texels = pyramid[min(level, len(pyramid) - 1)]
-            side = len(texels)
-            x, y = (across[i] % 1) * side - 0.5, (down[i] % 1) * side - 0.5
-            square = texels[np.ix_([int(np.floor(y)) % side, int(np.floor(y) + 1) % side],
-                                   [int(np.floor(x)) % side, int(np.floor(x) + 1) % side])]  # fmt: skip
-            top, bottom = square[:, 0] * (1 - x % 1) + square[:, 1] * (x % 1)
-            colors.append(top * (1 - y % 1) + bottom * (y % 1))
-        expected = (colors[0] * (1 - share) + colors[1] * share) / 255
-        np.testing.assert_allclose(rows(s, L.TEXEL)[:, i], expected, atol=0.02)
+    def blended(level):
+        """(color, point) between the four nearest texels of a level, which repeats."""
+        place = [down * len(level) - 0.5, across * len(level) - 0.5]
+        colors = np.moveaxis(level.astype(float), -1, 0)
+        return np.stack([ndimage.map_coordinates(color, place, order=1, mode="grid-wrap") for color in colors])
+
+    pyramid = np.stack([blended(level) for level in levels(picture)])
+    power = np.floor(np.log2(footprint))
+    detail = 0.5 * (power + footprint / 2**power - 1) + 0.25  # linear between powers of two
+    share, near = np.clip(2 * (detail % 1) - 1, 0, 1), detail.astype(int)
+    near, far = (pyramid[np.minimum(level, len(pyramid) - 1), :, np.arange(L.CHUNK)].T for level in (near, near + 1))
+    np.testing.assert_allclose(rows(s, L.TEXEL), (near * (1 - share) + far * share) / 255, atol=0.02)
 
 
 @pytest.mark.slow
@@ -110,7 +87,7 @@ def test_light_on_the_plane_is_blended_between_the_corners_of_triangles():
     k[L.LINES : L.LINES + 2], k[L.GRID], k[L.WINDOW : L.WINDOW + 4] = count, count, [0, count, 0, count]
     place = rng.uniform(-0.99, 0.99, (2, L.CHUNK))
     rows(s, L.U, 2)[:] = place
-    lit(s, L.CHUNK, k, rec, plane)
+    lamp_on_plane(s, L.CHUNK, k, rec, plane, 0)
 
     cells = (place * 2 + 2) / (line[1] - line[0])
     (r, c), (a, b) = np.floor(cells).astype(int), cells % 1

@@ -129,13 +129,9 @@ def odd_bounds():
     return arm(xml=one.replace('"wrist" ctrlrange="-1 1"', '"wrist" ctrlrange="-0.1 5"'))
 
 
-class TorquesAlone(Arm):
-    def get_observation(self, physics):
-        return {"torque": physics.data.sensordata.copy()}
-
-
 def flat_torques():
-    return arm(TorquesAlone(), flat_observation=True)
+    torques = having("Torques", get_observation=lambda self, physics: {"torque": physics.data.sensordata.copy()})
+    return arm(torques(), flat_observation=True)
 
 
 def odd_limit():

@@ -5,15 +5,12 @@ from __future__ import annotations
 import shutil
 import sys
 
-import mujoco
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from dm_control import suite
 from dm_control.utils import rewards
 
 from dmcvb_gen.arithmetic import to_unit
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.own_code import TASKS as ALLOWED
@@ -21,7 +18,7 @@ from dmcvb_gen.own_code import allow
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, PHYSICS_SPEC, get_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
-from tests.conftest import rewrite, roll_out
+from tests.conftest import invoke, rewrite, roll_out
 from tests.tasks.test_own_tasks import check_episode, rolled
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
@@ -41,15 +38,14 @@ SUITE = (
 FAST = ("ball_in_cup-catch", "finger-spin", "point_mass-easy", "quadruped-walk", "reacher-hard", "lqr-lqr_2_1")
 
 
+SLOW = (("random", 2), ("extreme", 2), ("zero", 2), ("random", 1))
+"""Kinds of actions and action repeats."""
+OTHERS = [name for name in SUITE if name not in LOCOMOTION_TASKS]
+
+
 def dm_control_observation(task_id, observation):
     names = sorted(observation) if task_id == "humanoid-walk" else observation
     return np.concatenate([np.atleast_1d(observation[name]) for name in names])
-
-
-def dm_control_physics(physics, size):
-    state = np.empty(size)
-    mujoco.mj_getState(physics.model.ptr, physics.data.ptr, state, PHYSICS_SPEC)
-    return state
 
 
 def actions_of(kind, rng, size):
@@ -62,11 +58,7 @@ def actions_of(kind, rng, size):
 
 @pytest.mark.parametrize(
     "kind, repeat",
-    [
-        ("random", 4),
-        *(pytest.param(kind, 2, marks=pytest.mark.slow) for kind in ("random", "extreme", "zero")),
-        pytest.param("random", 1, marks=pytest.mark.slow),
-    ],
+    [("random", 4), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
 )
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):
@@ -77,7 +69,7 @@ def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):
     environments = [suite.load(*task_id.split("-")) for _ in range(SIMULATIONS)]
     for environment, physics, own in zip(environments, batch.physics(), state, strict=True):
         environment.reset()
-        mujoco.mj_setState(environment.physics.model.ptr, environment.physics.data.ptr, physics, PHYSICS_SPEC)
+        environment.physics.set_state(physics, PHYSICS_SPEC)
         environment.physics.forward()
         theirs = dm_control_observation(task_id, environment.task.get_observation(environment.physics))
         np.testing.assert_allclose(own, theirs, rtol=0, atol=TOLERANCE[task_id])
@@ -92,7 +84,7 @@ def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):
             for _ in range(repeat):
                 step = environment.step(action[i])
                 reward += step.reward
-            np.testing.assert_array_equal(physics[i], dm_control_physics(environment.physics, task.physics_size))
+            np.testing.assert_array_equal(physics[i], environment.physics.get_state(PHYSICS_SPEC))
             theirs = dm_control_observation(task_id, step.observation)
             np.testing.assert_allclose(result.state[i], theirs, rtol=0, atol=TOLERANCE[task_id])
             assert abs(result.reward[i] - reward) <= REWARD_TOLERANCE
@@ -100,12 +92,7 @@ def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):
 
 
 @pytest.mark.parametrize(
-    "task_id",
-    [
-        pytest.param(name, marks=() if name in FAST else pytest.mark.slow)
-        for name in SUITE
-        if name not in LOCOMOTION_TASKS
-    ],
+    "task_id", [pytest.param(name, marks=() if name in FAST else pytest.mark.slow) for name in OTHERS]
 )
 def test_a_task_of_the_suite_is_dm_controls(task_id, monkeypatch):
     task = get_task(task_id)
@@ -188,7 +175,7 @@ def test_a_release_of_ones_own_task_is_verified_by_replay_and_not_checked_withou
     get_task.cache_clear()
     found = verify(tmp_path / "r")
     assert found.sound and not found.complete and "set DMCVB_GEN_TASKS=arm_tasks:ends" in str(found.unchecked[0])
-    assert CliRunner().invoke(main, ["verify", str(tmp_path / "r")]).exit_code == 3
+    invoke("verify", tmp_path / "r", code=3)
 
 
 def test_a_class_of_ones_own_steps_a_batch_by_itself(tmp_path, monkeypatch):
