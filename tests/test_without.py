@@ -25,9 +25,7 @@ for module in pkgutil.walk_packages(dmcvb_gen.__path__, "dmcvb_gen."):
 from dmcvb_gen.agents.data import default_memory
 assert default_memory() > 0
 for number, task in enumerate(("walker-walk", "ant-maze-tiny:****/*..*/****")):
-    release = dmcvb_gen.rollout(
-        tasks=[task], levels=["random"], episodes=1, max_steps=3, size=16, out=f"made{number}", workers=1
-    )
+    dmcvb_gen.rollout(task, levels="random", episodes=1, max_steps=3, size=16, out=f"made{number}", workers=1)
     assert dmcvb_gen.verify(f"made{number}").sound
 """
 

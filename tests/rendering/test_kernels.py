@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from numba import njit
 from scipy import ndimage
 
 from dmcvb_gen.rendering.native import layout as L
@@ -16,6 +17,22 @@ SOLIDS = """<mujoco><worldbody><geom type="sphere" size=".3" pos="-.9 .5 0"/>
 <geom type="capsule" size=".15 .3" pos="-.3 .5 0" euler="30 50 0"/><geom type="box" size=".2 .1 .3" pos=".4 .5 .1"
 euler="20 40 60"/><geom type="cylinder" size=".2 .3" pos="-.7 -.4 0" euler="70 10 0"/>
 <geom type="ellipsoid" size=".3 .1 .2" pos=".4 -.4 .2" euler="0 40 60"/></worldbody></mujoco>"""
+
+
+@njit
+def shadowed(s, n, k, rec):
+    aim_shadows(k, rec)
+    cast_shadows(s, n, k, rec, -1)
+
+
+@njit
+def sampled(s, n, texels, width):
+    sample_repeating(s, n, texels, width, 0)
+
+
+@njit
+def lit(s, n, k, rec, plane):
+    lamp_on_plane(s, n, k, rec, plane, 0)
 
 
 def rows(s, first, count=3):
@@ -39,8 +56,7 @@ def test_shadows_fall_where_mujocos_rays_are_blocked():
         s = np.zeros(L.ROWS * L.CHUNK, np.float32)
         points = rng.uniform([-1.5, -1.2, -1.0], [1.2, 1.2, -0.6], (L.CHUNK, 3))
         rows(s, L.POINT)[:], rows(s, L.LIGHT, 1)[:] = points.T, 1
-        aim_shadows(k, rec)
-        cast_shadows(s, L.CHUNK, k, rec, -1)
+        shadowed(s, L.CHUNK, k, rec)
         ways = points - lamp
         found = [mujoco.mj_ray(solids, data, lamp, way, None, 1, -1, np.zeros(1, np.int32)) for way in ways]
         blocked += [0 <= distance < 1 for distance in found]
@@ -61,7 +77,7 @@ def test_a_texture_is_a_blend_of_texels_of_the_two_nearest_levels():
     (across, down), footprint = rng.uniform(-2, 2, (2, L.CHUNK)), 4.0 ** rng.uniform(0, 4, L.CHUNK)
     for row, values in ((L.S, across), (L.T, down), (L.FOOTPRINT, footprint)):
         rows(s, row, 1)[:] = values
-    sample_repeating(s, L.CHUNK, textures.texels, textures.table.shape[1], 0)
+    sampled(s, L.CHUNK, textures.texels, textures.table.shape[1])
 
     def blended(level):
         """(color, point) between the four nearest texels of a level, which repeats."""
@@ -87,7 +103,7 @@ def test_light_on_the_plane_is_blended_between_the_corners_of_triangles():
     k[L.LINES : L.LINES + 2], k[L.GRID], k[L.WINDOW : L.WINDOW + 4] = count, count, [0, count, 0, count]
     place = rng.uniform(-0.99, 0.99, (2, L.CHUNK))
     rows(s, L.U, 2)[:] = place
-    lamp_on_plane(s, L.CHUNK, k, rec, plane, 0)
+    lit(s, L.CHUNK, k, rec, plane)
 
     cells = (place * 2 + 2) / (line[1] - line[0])
     (r, c), (a, b) = np.floor(cells).astype(int), cells % 1

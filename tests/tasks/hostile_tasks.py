@@ -282,14 +282,6 @@ def restarts_itself():
     return arm(kind=Environment)
 
 
-def no_environment():
-    return 7
-
-
-def fails():
-    return 1 / 0
-
-
 def quake(after=0.45):
     class Quake(Hills):
         def after_step(self, physics):
