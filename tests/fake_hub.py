@@ -13,6 +13,11 @@ import pytest
 from tests.web_server import give_files, serving
 
 
+def content(folder: Path) -> dict[str, bytes]:
+    """The files of a folder, by their paths in it."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 class FakeHub:
     """One repository of data sets, the newest version of its files in `folder`.
 
@@ -26,8 +31,7 @@ class FakeHub:
 
     @property
     def files(self) -> dict[str, bytes]:
-        paths = [path for path in self.folder.rglob("*") if path.is_file()]
-        return {path.relative_to(self.folder).as_posix(): path.read_bytes() for path in paths}
+        return content(self.folder)
 
     def create_repo(self, repo_id, repo_type, exist_ok):
         assert repo_type == "dataset" and exist_ok

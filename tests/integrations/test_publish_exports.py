@@ -11,13 +11,9 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.release.export import export
 from dmcvb_gen.release.export.publishing import export_format, publish_export
 from tests.conftest import invoke
-from tests.fake_hub import fake_hub
+from tests.fake_hub import content, fake_hub
 
 SUBSETS = ("walker-walk/random/static", "ant-maze-tiny/random/hidden")
-
-
-def content(folder):
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize(("to", "name"), zip(("hdf5", "lerobot"), SUBSETS, strict=True))
