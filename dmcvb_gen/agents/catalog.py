@@ -24,20 +24,11 @@ MOST = 64
 """The largest number that an option takes."""
 
 
-def policies() -> tuple[str, ...]:
-    """The registered policies."""
-    return tuple(name for name, part in PARTS.all().items() if issubclass(part, Policy))
-
-
-def encoders() -> tuple[str, ...]:
-    """Return the names that may pre-train an encoder."""
-    return tuple(name for name, part in PARTS.all().items() if issubclass(part, ReadyEncoder) or part.pretrains)
-
-
 def agent_names() -> tuple[str, ...]:
     """The names that `parse_agent` takes, options left out."""
-    own = policies()
-    return (*own, *(f"state-{name}" for name in own), *(f"{encoder}+{name}" for name in own for encoder in encoders()))
+    own = [name for name, part in PARTS.all().items() if issubclass(part, Policy)]
+    encoders = [name for name, part in PARTS.all().items() if issubclass(part, ReadyEncoder) or part.pretrains]
+    return (*own, *(f"state-{name}" for name in own), *(f"{encoder}+{name}" for name in own for encoder in encoders))
 
 
 @dataclass(frozen=True)

@@ -105,14 +105,9 @@ class FrameTable:
         mirror = np.pad(np.arange(self.size), PAD, mode="symmetric")  # which pixel stands where, after padding
         self._mirror = torch.from_numpy(mirror).to(self.table.device)
 
-    @property
-    def pictures(self) -> torch.Tensor:
-        """(row, channel, size, size) uint8, a view."""
-        return self.table[..., PAD:-PAD]
-
-    def shifted(self, rows: torch.Tensor, down: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-        """(batch, frames) rows, (batch,) offsets in 0..2 PAD -> (batch, frames x channels, size, size) uint8."""
-        rows, down, right = (values.to(self._mirror.device) for values in (rows, down, right))
+    def shifted(self, rows: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
+        """(batch, frames) rows, (2, batch) offsets -> (batch, frames x channels, size, size) uint8."""
+        rows, (down, right) = rows.to(self._mirror.device), shift.to(self._mirror.device)
         if self._file is not None:
             frame = self.table[0].numel()
             for first, last in rows[:, [0, -1]].tolist():
@@ -232,24 +227,23 @@ class TrainingData:
     def observe(
         self,
         rows: torch.Tensor,
-        down: torch.Tensor | None = None,
-        right: torch.Tensor | None = None,
+        shift: torch.Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         out: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures.
 
         Args:
-          down, right: (batch,) long, offsets of the pictures in 0..2 PAD; None: not shifted.
+          shift: (2, batch) long, offsets of the pictures down and right in 0..2 PAD; None: not shifted.
           dtype: dtype of pictures. out: memory to write them to, if given.
         """
         if self.frames is None:
             return self.state[rows]
-        if down is None or right is None:
-            down = right = torch.full_like(rows, PAD)
+        if shift is None:
+            shift = rows.new_full((2, len(rows)), PAD)
         back = torch.arange(self.stack - 1, -1, -1, device=rows.device)
         stacks = torch.maximum(rows[:, None] - back, self.start[rows][:, None])
-        return normalize_pixels(self.frames.shifted(stacks, down, right).to(self.device), dtype, out)
+        return normalize_pixels(self.frames.shifted(stacks, shift).to(self.device), dtype, out)
 
     def batch(
         self,
@@ -284,20 +278,19 @@ class TrainingData:
             kind = "held-out " if hold_out else ""
             raise DmcvbError(f"there are no {kind}transitions to draw from (k = {k}); roll out more episodes")
         index = generator.integers(len(rows), size=size)
-        down = right = steps = None
+        offsets = steps = None
         if shift and not hold_out and self.frames is not None and self.latent is None:
-            down, right = map(self._to_device, generator.integers(2 * PAD + 1, size=(2, size)))
+            offsets = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
         if next_observation:
             drawn = generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k)
             steps = self._to_device(drawn)
-        return self.transitions(rows[self._to_device(index)], steps, down, right, later=later, **options)
+        return self.transitions(rows[self._to_device(index)], steps, offsets, later=later, **options)
 
     def transitions(
         self,
         rows: torch.Tensor,
         steps: torch.Tensor | None = None,
-        down: torch.Tensor | None = None,
-        right: torch.Tensor | None = None,
+        shift: torch.Tensor | None = None,
         dtype: torch.dtype = torch.float32,
         reuse: Batch | None = None,
         pictures: bool = True,
@@ -308,7 +301,7 @@ class TrainingData:
         Args:
           rows: (batch,) long.
           steps: (batch,) long, how far off the next observation is; None: no next observation.
-          down, right, dtype: see `observe`. Half the bytes are half the time to write them.
+          shift, dtype: see `observe`. Half the bytes are half the time to write them.
           reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
             memory for a large batch costs several times the work that fills it.
           pictures: give observations even if the data are encoded.
@@ -316,12 +309,12 @@ class TrainingData:
         """
         now = following = last = None
         if pictures or self.latent is None:
-            now = self.observe(rows, down, right, dtype, reuse and reuse.observation)
+            now = self.observe(rows, shift, dtype, reuse and reuse.observation)
             if steps is not None:
                 after = rows + (1 if later else steps)
-                following = self.observe(after, down, right, dtype, reuse and reuse.next_observation)
+                following = self.observe(after, shift, dtype, reuse and reuse.next_observation)
             if later:
-                last = self.observe(rows + steps, down, right, dtype, reuse and reuse.later_observation)
+                last = self.observe(rows + steps, shift, dtype, reuse and reuse.later_observation)
         latent = self.latent
         return Batch(
             observation=now,
@@ -425,20 +418,12 @@ def choose_episodes(subset: Subset, part: Slice, seed: int) -> tuple[np.ndarray,
         names = names[subset.read("goal_pair") == part.goal_pair]
         if not len(names):
             raise DmcvbError(f"{subset.name} has no episodes of goal pair {part.goal_pair}")
-    order = np.random.default_rng(seed).permutation(len(names))
     count = min(part.episodes or part_count(part.share, len(names)), len(names))
+    chosen = np.random.default_rng(seed).permutation(len(names))[:count]
     few = part.episodes is not None or part.goal_pair is not None
-    out = 0 if few else count - training_episodes(count)
-    chosen = order[:count]
-    held = np.zeros(count, bool)
-    held[:out] = True
+    held = np.arange(count) < (0 if few else min(math.ceil(HOLD_OUT * count), count - 1))
     by_name = np.argsort(names[chosen])
     return names[chosen][by_name], held[by_name]
-
-
-def training_episodes(count: int) -> int:
-    """Episodes of `count` that agents learn from; the others are held out."""
-    return count - min(math.ceil(HOLD_OUT * count), count - 1)
 
 
 def default_memory(device: str = "cpu") -> int:

@@ -18,32 +18,25 @@ import torch.nn.functional as F
 from torch import nn
 
 from dmcvb_gen.agents.data import Sizes
-from dmcvb_gen.agents.learners import Batch, Learner, frozen_copy, move_towards, register_agent
-from dmcvb_gen.agents.networks import MLP, PAPER, Architecture, Encoder, initialize, observation_encoder
+from dmcvb_gen.agents.lapo import LatentActions
+from dmcvb_gen.agents.learners import frozen_copy, move_towards, register_agent
+from dmcvb_gen.agents.networks import MLP, PAPER, Architecture, Encoder, initialize
 
 
 @register_agent("laom")
-class LatentActionObservationModel(Learner):
+class LatentActionObservationModel(LatentActions):
     """|| e_EMA(o_t+1) - g(e(o_t), f(e(o_t), e(o_t+k))) ||^2 + || phi(o_t) - z ||^2, z = f(e(o_t), e(o_t+1)).
 
     phi is kept. k is drawn from 1..10. No gradient of the second term reaches f and e.
     """
 
-    needs_next = needs_later = sample_k = True
+    needs_later = sample_k = True
     k_max, decay = 10, 0.999
 
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
-        super().__init__()
-        self.encoder, width = encoder, encoder.features
-        self.see = observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
+        super().__init__(encoder, sizes, architecture)
         self.target = frozen_copy(self.see)
-        self.f = MLP(2 * width, width, tanh=True)
-        self.g = MLP(2 * width, width, tanh=True)
-
-    def latent_action(self, batch: Batch) -> torch.Tensor:
-        """z: (batch, latent) in (-1, 1), of one step."""
-        both = self.see(torch.cat([batch.observation, batch.next_observation]))
-        return self.f(torch.cat(both.chunk(2), dim=1)).float()
+        self.g = MLP(2 * encoder.features, encoder.features, tanh=True)
 
     def losses(self, batch):
         seen, later = self.see(torch.cat([batch.observation, batch.later_observation])).chunk(2)

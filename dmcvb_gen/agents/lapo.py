@@ -25,31 +25,39 @@ COMMITMENT, KEEP = 0.05, 0.999
 """Weight of the loss that draws latent actions to their codes; decay of the codes' averages."""
 
 
+class LatentActions(Learner):
+    """Base: phi beside an inverse model f, which sees two observations through an encoder of its own."""
+
+    needs_next = True
+
+    def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture):
+        super().__init__()
+        self.encoder, width = encoder, encoder.features
+        self.see = observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
+        self.f = MLP(2 * width, width, tanh=True)
+
+    def latent_action(self, batch: Batch) -> torch.Tensor:
+        """z: (batch, latent) in (-1, 1), of one step."""
+        both = self.see(torch.cat([batch.observation, batch.next_observation]))
+        return self.f(torch.cat(both.chunk(2), dim=1)).float()
+
+
 @register_agent("lapo")
-class LatentActionPolicy(Learner):
+class LatentActionPolicy(LatentActions):
     """|| o_t+1 - g(o_t, q(z)) ||^2 + || phi(o_t) - z ||^2, z = f(o_t, o_t+1), q the nearest codes; phi is kept.
 
     No gradient of the second term reaches f.
     """
 
-    needs_next = True
-
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
-        super().__init__()
-        self.encoder, width = encoder, encoder.features
-        self.newest = slice(-(sizes.channels // sizes.stack), None)  # channels of the newest frame
-        self.see = observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
-        self.f = MLP(2 * width, width, tanh=True)
-        self.g = ObservationDecoder(sizes.channels // sizes.stack, sizes.picture, 2 * width, architecture)
+        super().__init__(encoder, sizes, architecture)
+        channels = sizes.channels // sizes.stack
+        self.newest = slice(-channels, None)  # channels of the newest frame
+        self.g = ObservationDecoder(channels, sizes.picture, 2 * encoder.features, architecture)
         codes = (2 * torch.rand(CODES, CODE_WIDTH) - 1) * 5 / CODES
         self.register_buffer("codes", codes)
         self.register_buffer("sums", codes.clone())  # of the latent actions nearest to each code, averaged over time
         self.register_buffer("counts", torch.ones(CODES))
-
-    def latent_action(self, batch: Batch) -> torch.Tensor:
-        """z: (batch, latent) in (-1, 1), before it is replaced by codes."""
-        both = self.see(torch.cat([batch.observation, batch.next_observation]))
-        return self.f(torch.cat(both.chunk(2), dim=1)).float()
 
     def quantize(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(batch, latent) as the nearest codes, whose gradient is z's, and the squared distance to them."""

@@ -55,6 +55,10 @@ class Batch:
     next_latent: torch.Tensor | None = None
     labeled: Batch | None = None
 
+    def seen_by(self, encoder: nn.Module) -> torch.Tensor:
+        """phi(o): the latents that were computed once, if the batch has them, else what `encoder` makes of o."""
+        return encoder(self.observation) if self.latent is None else self.latent
+
 
 def adam(modules: Iterable[nn.Module], lr: float = LEARNING_RATE) -> torch.optim.Adam:
     """Adam over all trainable parameters of the modules (one fused kernel: the trunk alone has 4 million)."""

@@ -78,7 +78,6 @@ class Trunk(nn.Sequential):
 
     def __init__(self, features: int, latent: int = LATENT):
         super().__init__(nn.Linear(features, latent), nn.LayerNorm(latent), nn.Tanh())
-        self.features = latent
         initialize(self)
 
 
@@ -117,10 +116,8 @@ class FrameDifferences(nn.Conv2d):
     def __init__(self, channels: int, out: int, kernel: int, stride: int, padding: int, frames: int):
         super().__init__(channels, out, kernel, stride, padding)
         self.frames = frames
-        of_frames = torch.zeros(frames, frames)  # (input, frame): input 0 is the newest frame, the others differences
-        of_frames[0, -1] = 1
-        for index in range(1, frames):
-            of_frames[index, frames - index], of_frames[index, frames - index - 1] = 1, -1
+        newest = torch.eye(frames).flip(0)  # (frame, frame), the newest one first
+        of_frames = torch.cat([newest[:1], newest[:-1] - newest[1:]])  # (input, frame): the others are differences
         self.register_buffer("of_frames", of_frames, persistent=False)
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
@@ -160,14 +157,13 @@ class Encoder(nn.Module):
 
     Args:
       body: `Convolutions` for pictures, `nn.Identity` for states.
-      features: width of the body's output.
-      latent: width of the latent.
+      trunk: from the body's output to the latent.
+      features: width of the latent.
     """
 
-    def __init__(self, body: nn.Module, features: int, latent: int = LATENT):
+    def __init__(self, body: nn.Module, trunk: nn.Module, features: int = LATENT):
         super().__init__()
-        self.body, self.trunk = body, Trunk(features, latent)
-        self.features = latent
+        self.body, self.trunk, self.features = body, trunk, features
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return self.trunk(self.body(observation))
@@ -176,12 +172,12 @@ class Encoder(nn.Module):
 def observation_encoder(channels: int, size: int = 64, architecture: Architecture = PAPER, frames: int = 3) -> Encoder:
     """phi for frame stacks."""
     body = Convolutions(channels, size, architecture, frames)
-    return Encoder(body, body.features, architecture.latent)
+    return Encoder(body, Trunk(body.features, architecture.latent), architecture.latent)
 
 
 def state_encoder(state_size: int) -> Encoder:
     """phi for states: the trunk alone, neither convolutions nor frame stack."""
-    return Encoder(nn.Identity(), state_size)
+    return Encoder(nn.Identity(), Trunk(state_size))
 
 
 class MLP(nn.Sequential):

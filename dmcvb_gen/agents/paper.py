@@ -24,18 +24,14 @@ class BehaviorCloning(Policy):
 
     def __init__(self, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER, frozen: bool = False):
         super().__init__()
-        self.encoder, self.frozen = encoder.requires_grad_(not frozen), frozen
+        self.encoder = encoder.requires_grad_(not frozen)
         self.policy = MLP(encoder.features, sizes.action, tanh=True)
 
-    def _phi(self, o: torch.Tensor) -> torch.Tensor:
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
-            return self.encoder(o)
-
     def act(self, observation):
-        return self.policy(self._phi(observation))
+        return self.policy(self.encoder(observation))
 
     def losses(self, batch):
-        phi_o = self._phi(batch.observation) if batch.latent is None else batch.latent  # (batch, latent)
+        phi_o = batch.seen_by(self.encoder)  # (batch, latent)
         return {"loss": F.mse_loss(self.policy(phi_o).float(), batch.action)}
 
 
@@ -101,8 +97,12 @@ class Autoencoder(Learner):
         self.encoder = encoder
         self.psi = ObservationDecoder(sizes.channels, sizes.picture, encoder.features, architecture)
 
+    def predict(self, batch: Batch) -> torch.Tensor:
+        """(batch, channels, size, size): the observations as the decoder sees them."""
+        return self.psi(batch.seen_by(self.encoder))
+
     def losses(self, batch):
-        return {"loss": F.mse_loss(self.psi(self.encoder(batch.observation)).float(), batch.observation.float())}
+        return {"loss": F.mse_loss(self.predict(batch).float(), batch.observation.float())}
 
 
 @register_agent("state")
@@ -120,20 +120,11 @@ class StatePrediction(Learner):
 # -- what a frozen encoder still knows (section 5.1) ---------------------------------------------------------
 
 
-class ObservationProbe(Learner):
+class ObservationProbe(Autoencoder):
     """|| psi(phi(o)) - o ||^2 over psi, phi frozen."""
 
     def __init__(self, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER):
-        super().__init__()
-        self.encoder = encoder.requires_grad_(False)
-        self.psi = ObservationDecoder(sizes.channels, sizes.picture, encoder.features, architecture)
-
-    def predict(self, batch: Batch) -> torch.Tensor:
-        """(batch, channels, size, size): the observations as the decoder sees them."""
-        return self.psi(_frozen_phi(self.encoder, batch))
-
-    def losses(self, batch):
-        return {"loss": F.mse_loss(self.predict(batch).float(), batch.observation.float())}
+        super().__init__(encoder.requires_grad_(False), sizes, architecture)
 
 
 class StateProbe(Learner):
@@ -145,16 +136,5 @@ class StateProbe(Learner):
         super().__init__()
         self.encoder, self.h = encoder.requires_grad_(False), MLP(encoder.features, sizes.state)
 
-    def predict(self, batch: Batch) -> torch.Tensor:
-        """(batch, state): the normalized states as the decoder sees them."""
-        return self.h(_frozen_phi(self.encoder, batch)).float()
-
     def losses(self, batch):
-        return {"loss": F.mse_loss(self.predict(batch), batch.state)}
-
-
-def _frozen_phi(encoder: nn.Module, batch: Batch) -> torch.Tensor:
-    if batch.latent is not None:
-        return batch.latent
-    with torch.no_grad():
-        return encoder(batch.observation)
+        return {"loss": F.mse_loss(self.h(batch.seen_by(self.encoder)).float(), batch.state)}

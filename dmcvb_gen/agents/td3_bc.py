@@ -8,7 +8,7 @@ from torch import nn
 
 from dmcvb_gen.agents.data import Sizes
 from dmcvb_gen.agents.learners import EMA_DECAY, Batch, Policy, adam, frozen_copy, move_towards, register_agent
-from dmcvb_gen.agents.networks import LATENT, MLP, PAPER, Architecture, Convolutions, Trunk
+from dmcvb_gen.agents.networks import LATENT, MLP, PAPER, Architecture, Convolutions, Encoder, Trunk
 
 
 class _ActorCritic(nn.Module):
@@ -35,17 +35,6 @@ class _ActorCritic(nn.Module):
         """(batch,): one critic's value, in float32 throughout: half precision is too coarse for returns."""
         with torch.autocast(latent.device.type, enabled=False):
             return critic(torch.cat([latent.float(), action.float()], dim=1))[:, 0]
-
-
-class ActorEncoder(nn.Module):
-    """Body and actor's trunk of an actor-critic, as one encoder."""
-
-    def __init__(self, net: _ActorCritic):
-        super().__init__()
-        self.body, self.trunk, self.features = net.body, net.actor_trunk, net.features
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return self.trunk(self.body(observation))
 
 
 @register_agent("td3-bc")
@@ -77,7 +66,7 @@ class TD3BC(Policy):
         alpha: float = 2.5,
     ):
         super().__init__()
-        self.frozen, self.alpha = frozen, alpha
+        self.alpha = alpha
         if frozen:
             body, features, trunk = encoder.requires_grad_(False), encoder.features, None
         elif sizes.channels:
@@ -95,40 +84,32 @@ class TD3BC(Policy):
         }
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
 
-    def _body(self, observation):
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
-            return self.net.body(observation)
-
-    def _seen(self, batch: Batch) -> torch.Tensor:
-        return self._body(batch.observation) if batch.latent is None else batch.latent
-
     @property
     def encoder(self) -> nn.Module:
         """phi as the actor sees it: body and actor's trunk."""
-        return ActorEncoder(self.net)
+        return Encoder(self.net.body, self.net.actor_trunk, self.net.features)
 
     def act(self, observation):
-        return self.net.act(self._body(observation))
+        return self.net.act(self.net.body(observation))
 
     @torch.no_grad()
-    def target_value(self, batch: Batch, noise: torch.Tensor | None = None) -> torch.Tensor:
+    def target_value(self, batch: Batch) -> torch.Tensor:
         """y: (batch,)."""
         body = self.target.body(batch.next_observation) if batch.next_latent is None else batch.next_latent
-        if noise is None:
-            noise = torch.randn_like(batch.action) * self.noise
+        noise = torch.randn_like(batch.action) * self.noise
         action = (self.target.act(body) + noise.clamp(-self.noise_clip, self.noise_clip)).clamp(-1, 1)
         return batch.reward + self.gamma * batch.discount * torch.minimum(*self.target.values(body, action))
 
     def critic_loss(self, batch: Batch) -> torch.Tensor:
         with torch.no_grad():
-            latent = self.net.critic_trunk(self._seen(batch))
+            latent = self.net.critic_trunk(batch.seen_by(self.net.body))
         y = self.target_value(batch)
         critics = (self.net.critic1, self.net.critic2)
         return sum(F.mse_loss(self.net.value(critic, latent, batch.action), y) for critic in critics)
 
     def actor_loss(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
         """The actor's loss, and the cloning error in it."""
-        body = self._seen(batch)
+        body = batch.seen_by(self.net.body)
         action = self.net.act(body)
         value = self.net.values(body, action)[0]
         scale = self.alpha / value.abs().mean().detach().clamp(min=1e-6)

@@ -174,9 +174,8 @@ def train(
       DmcvbError: a loss is no longer finite.
     """
     pixels = data.frames is not None
-    size, learner.half = budget.state_batch_size, pixels and budget.precision == "bfloat16"
-    if pixels:
-        size = budget.batch_size
+    size = budget.batch_size if pixels else budget.state_batch_size
+    learner.half = pixels and budget.precision == "bfloat16"
     if pixels and budget.muon:
         dtype = torch.bfloat16 if learner.half else torch.float32
         learner.optimizers = {name: Muon.instead_of(one, dtype) for name, one in learner.optimizers.items()}

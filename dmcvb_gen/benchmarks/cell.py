@@ -36,17 +36,19 @@ from dmcvb_gen.agents.learners import Learner, Policy
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.probe import action_probe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
-from dmcvb_gen.benchmarks.evaluate import Evaluator, Score, TrainedAgent, protocol, renderer_choice
+from dmcvb_gen.benchmarks.evaluate import SPLIT, Evaluator, Score, TrainedAgent, evaluation_steps, renderer_choice
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.manifest import canonical_json
+from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
+from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
-from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, cores, ignore, open_pool
+from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, ignore, open_pool
 from dmcvb_gen.policies.evaluation import goal_speed
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.version import __version__
 
 RESULT_VERSION = 6
@@ -67,31 +69,35 @@ def open_data(root: str | Path, budget: Budget) -> Release:
     return painted_release(Release.open(root), Painting(backgrounds=budget.backgrounds, cache_bytes=room), True)
 
 
-def data_digest(subset: Subset) -> str:
-    """SHA-256 of the records of all shards of a subset that are here."""
-    release, digest = subset.release, hashlib.sha256()
-    for layer in subset.layers:
-        here = release.here(layer.name)
-        for shard, record in release.records(layer.name).items():
-            if shard in here:
-                digest.update(f"{layer.name} {shard} ".encode() + canonical_json(record))
-    return digest.hexdigest()
-
-
 def data_digests(release: Release, cell: Cell) -> dict[str, str]:
-    """Subset -> digest of its data, of all that a cell learns from."""
-    return {name: data_digest(release[name]) for name in sorted(cell.subsets)}
+    """Subset -> SHA-256 of the records of all its shards that are here, of all that a cell learns from."""
+    digests = {name: hashlib.sha256() for name in sorted(cell.subsets)}
+    for name, digest in digests.items():
+        for layer in release[name].layers:
+            here = release.here(layer.name)
+            for shard, record in release.records(layer.name).items():
+                if shard in here:
+                    digest.update(f"{layer.name} {shard} ".encode() + canonical_json(record))
+    return {name: digest.hexdigest() for name, digest in digests.items()}
 
 
 def evaluation_of(release: Release, budget: Budget, cell: Cell) -> dict[str, Any]:
-    """All that decides the evaluation of a cell's policy, as plain values (`evaluate.protocol`).
+    """All that decides the episodes of a cell's evaluation but the policy, as plain values.
 
     Raises:
       BackgroundError: there are no `val` videos.
     """
     subset, pair = release[cell.policy[0].subset], cell.policy[0].goal_pair
-    shown = dict(pictures=not cell.agent.sees_state, max_steps=budget.episode_steps)
-    return protocol(subset, goal_cells(subset, pair), budget.backgrounds, **shown)
+    task = get_task(subset.task).at(subset.record.action_repeat)
+    facts = {"steps": evaluation_steps(task, budget.episode_steps), "goals": goal_cells(subset, pair)}
+    if task.action_repeat != ACTION_REPEAT:
+        facts["action_repeat"] = task.action_repeat
+    if not cell.agent.sees_state:
+        facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
+        if subset.record.distractor.kind != "none":
+            source = video_source(release.path, subset.record, budget.backgrounds)
+            facts["backgrounds"] = load_backgrounds(source, SPLIT).digest
+    return facts
 
 
 def fingerprint(release: Release, budget: Budget, cell: Cell) -> str:
@@ -468,8 +474,3 @@ def planned_steps(budget: Budget, cells: Sequence[Cell]) -> int:
     decoders = sum(2 * budget.readout_steps for cell in cells if not cell.agent.sees_state)
     policies = sum(policy_steps(budget, cell.agent) for cell in cells)
     return policies + decoders + len(encoders) * budget.pixel_steps
-
-
-def default_workers(device: str) -> int:
-    """Cells side by side: two of one thread each are faster than one of two. An accelerator is not shared."""
-    return cores.default_workers(2 if device == "cpu" else 1)

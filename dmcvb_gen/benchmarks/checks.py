@@ -144,11 +144,12 @@ def known_returns(release: Release) -> dict[str, np.ndarray]:
     return {name: returns for name, returns in found.items() if len(returns)}
 
 
-def painter_drift(release: Release, backgrounds: str | None = None) -> tuple[str, ...]:
-    """List the versions that differ from those for which the pictures rendered on reading are promised."""
+def _painter_drift(release: Release, backgrounds: str | None) -> Iterator[Issue]:
+    """Warn of versions that differ from those for which the pictures rendered on reading are promised."""
     painted = [subset.record for subset in release.subsets.values() if isinstance(subset, PaintedSubset)]
     sources = {record.name: background_source(release.path, record, backgrounds) for record in painted}
-    return render_differences(release, painted, sources)
+    for text in render_differences(release, painted, sources):
+        yield Issue("painter", "images painted on reading", text)
 
 
 def check_structure(
@@ -177,8 +178,7 @@ def check_structure(
         for found, odd in in_order(_check_subset, readable, pool):
             findings += found
             warnings += odd
-    for text in painter_drift(release, backgrounds):
-        warnings.append(Issue("painter", "images painted on reading", text))
+    warnings += _painter_drift(release, backgrounds)
     return Structure(verified.checked, tuple(findings), tuple(warnings), time.perf_counter() - started)
 
 

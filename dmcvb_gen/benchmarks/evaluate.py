@@ -103,30 +103,6 @@ def evaluation_steps(task: Task, max_steps: int | None = None) -> int:
     return min(max_steps or task.evaluation_steps, task.evaluation_steps)
 
 
-def protocol(
-    subset: Subset,
-    pair: tuple | None = None,
-    backgrounds: str | None = None,
-    pictures: bool = True,
-    max_steps: int | None = None,
-) -> dict[str, Any]:
-    """All that decides an evaluation's episodes but the policy, as plain values; arguments as for `Evaluator`.
-
-    Raises:
-      BackgroundError: there are no `val` videos.
-    """
-    task = get_task(subset.task).at(subset.record.action_repeat)
-    facts: dict[str, Any] = {"steps": evaluation_steps(task, max_steps), "goals": pair}
-    if task.action_repeat != ACTION_REPEAT:
-        facts["action_repeat"] = task.action_repeat
-    if pictures:
-        facts |= {"size": subset.record.size, "renderer": renderer_choice(subset), "backgrounds": None}
-        if subset.record.distractor.kind != "none":
-            source = video_source(subset.release.path, subset.record, backgrounds)
-            facts["backgrounds"] = load_backgrounds(source, SPLIT).digest
-    return facts
-
-
 def renderer_choice(subset: Subset) -> dict[str, Any]:
     """Name and samples of the renderer: the data's own, or the default one if the record names none of ours."""
     if subset.record.imported or not subset.record.renderer:
@@ -459,7 +435,7 @@ class TrainedAgent:
     Attributes:
       agent: what it is, e.g. "id+bc" by its name. sizes: sizes of its observations and actions.
       policy, normalization: its networks, and the normalization of the states that it learned from.
-      evaluation: what `protocol` says of the evaluation that belongs to its data; {} if it is not known.
+      evaluation: what decides the evaluation that belongs to its data (`cell.evaluation_of`); {} if it is not known.
     """
 
     agent: Agent

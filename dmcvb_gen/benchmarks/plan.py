@@ -243,14 +243,18 @@ class SubsetFinder:
             return None
         return tuple(self._names[task, level, setting] for level in levels)
 
-    def parts(self, task: str, levels: Iterable[str], setting: str, **share: Any) -> tuple[Slice, ...] | None:
+    def parts(self, task: str, levels: Iterable[str], setting: str) -> tuple[Slice, ...] | None:
+        """All of these subsets, or None (see `find`)."""
         names = self.find(task, levels, setting)
-        return names and tuple(Slice(name, **share) for name in names)
+        return names and tuple(map(Slice, names))
 
-    def first(self, task: str, level: str, setting: str, most: int) -> tuple[Slice, ...] | None:
-        """Some episodes of a subset, all of them if it has no more than that."""
-        names = self.find(task, [level], setting)
-        return names and tuple(Slice(name, episodes=min(most, len(self.release[name].episodes))) for name in names)
+    def experts(self) -> Iterator[tuple[str, str, str, int]]:
+        """(task, setting, name, number of episodes) of every expert subset; of mazes, where goals are visible."""
+        for task in self.tasks:
+            for setting in [VISIBLE] if is_maze(task) else self.settings(task):
+                names = self.find(task, ["expert"], setting)
+                if names:
+                    yield task, setting, names[0], len(self.release[names[0]].episodes)
 
     def missing(self, benchmark: str) -> list[Missing]:
         """Requests that nothing in the release fits, by task."""
@@ -449,10 +453,11 @@ class FewEpisodes(Benchmark):
             if full:
                 yield Cell(self.name, task, "none", bc, full)  # scores are shares of this one
             for setting in data.settings(task):
-                few = data.first(task, "expert", setting, self.few)
-                mixed = data.parts(task, ["mixed"], setting)
-                if not few:
+                expert, mixed = data.find(task, ["expert"], setting), data.parts(task, ["mixed"], setting)
+                if not expert:
                     continue
+                there = len(data.release[expert[0]].episodes)
+                few = (Slice(expert[0], episodes=min(self.few, there)),)
                 yield Cell(self.name, task, setting, bc, few)
                 if mixed:
                     yield Cell(self.name, task, setting, bc, few + mixed)
@@ -499,19 +504,14 @@ class Ablations(Benchmark):
     shares = (0.01, 0.05, 0.1, 0.25, 0.5)
 
     def cells(self, data, agents):
-        for task in data.tasks:
-            for setting in [VISIBLE] if is_maze(task) else data.settings(task):
-                parts = data.parts(task, ["expert"], setting)
-                if not parts:
-                    continue
-                for agent in agents:
-                    yield Cell(self.name, task, setting, agent, parts)
-                by_pictures = [agent for agent in agents if agent.name == "bc"]
-                episodes = len(data.release[parts[0].subset].episodes)
-                counts = {part_count(share, episodes): share for share in self.shares}  # one share of equal counts
-                shares = [share for count, share in counts.items() if count < episodes]
-                for share, agent in itertools.product(shares, by_pictures):
-                    yield Cell(self.name, task, setting, agent, (Slice(parts[0].subset, share=share),))
+        for task, setting, name, there in data.experts():
+            for agent in agents:
+                yield Cell(self.name, task, setting, agent, (Slice(name),))
+            by_pictures = [agent for agent in agents if agent.name == "bc"]
+            counts = {part_count(share, there): share for share in self.shares}  # one share of equal counts
+            shares = [share for count, share in counts.items() if count < there]
+            for share, agent in itertools.product(shares, by_pictures):
+                yield Cell(self.name, task, setting, agent, (Slice(name, share=share),))
 
 
 @register_benchmark("b4")
@@ -529,18 +529,14 @@ class LabelBudgets(Benchmark):
 
     def cells(self, data, agents):
         bc = parse_agent("bc")
-        for task in data.tasks:
-            for setting in [VISIBLE] if is_maze(task) else data.settings(task):
-                whole = data.parts(task, ["expert"], setting)
-                if not whole:
-                    continue
-                yield Cell(self.name, task, setting, bc, whole)  # scores are shares of this one
-                there = len(data.release[whole[0].subset].episodes)
-                for budget in [budget for budget in self.budgets if budget < there]:
-                    labeled = (Slice(whole[0].subset, episodes=budget),)
-                    yield Cell(self.name, task, setting, bc, labeled)
-                    for agent in agents:
-                        yield Cell(self.name, task, setting, agent, labeled, whole)
+        for task, setting, name, there in data.experts():
+            whole = (Slice(name),)
+            yield Cell(self.name, task, setting, bc, whole)  # scores are shares of this one
+            for budget in [budget for budget in self.budgets if budget < there]:
+                labeled = (Slice(name, episodes=budget),)
+                yield Cell(self.name, task, setting, bc, labeled)
+                for agent in agents:
+                    yield Cell(self.name, task, setting, agent, labeled, whole)
 
     def reference(self, cell):
         return "BC on all labels"

@@ -80,23 +80,20 @@ def validate(
         CUDA device, or the report's folder cannot be written or holds results of another release or budget.
     """
     asked = {name: value for name, value in locals().items() if name in TRAINING}
-    from dmcvb_gen.benchmarks.cell import default_workers, kept_results, open_data, planned_steps, run_cells
+    from dmcvb_gen.benchmarks.cell import kept_results, open_data, planned_steps, run_cells
     from dmcvb_gen.benchmarks.checks import check_structure, seen_warnings
     from dmcvb_gen.benchmarks.report import Validation, claim_folder, plan_validation, report_facts, write_report
+    from dmcvb_gen.parallel.cores import default_workers
     from dmcvb_gen.storage.places import local_path
 
     started = time.perf_counter()
     if checks_only:
         _refuse_training(**asked)
     names = agent_names(agents, dino_weights)
-    workers = workers or default_workers(device)
-    budget = make_budget(
-        *(profile, scale, workers, threads, device, precision, memory),
-        compile=compile,
-        seed=seed,
-        dino_weights=dino_weights,
-        backgrounds=backgrounds,
-    )
+    # Two cells of one thread each are faster than one of two; an accelerator is not shared.
+    workers = workers or default_workers(2 if device == "cpu" else 1)
+    fields = dict(compile=compile, seed=seed, dino_weights=dino_weights, backgrounds=backgrounds)
+    budget = _budget(profile, scale, workers, threads, device, precision, memory, **fields)
     data, patterns = open_data(release, budget), as_names(only)
     chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
     if patterns:  # a subset that was not asked for is not missing
@@ -149,16 +146,7 @@ def agent_names(agents: Names | None, dino_weights: Location | None) -> list[str
     return names
 
 
-def make_budget(
-    profile: str = "smoke",
-    scale: float = 1.0,
-    workers: Workers = 1,
-    threads: int | None = None,
-    device: str = "cpu",
-    precision: str = "auto",
-    memory: float | None = None,
-    **fields: Any,
-) -> "Budget":
+def _budget(profile, scale, workers, threads, device, precision, memory, **fields) -> "Budget":
     """The budget of a validation.
 
     Args:

@@ -24,7 +24,7 @@ from torch.nn.functional import softplus
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.training.run import Run
-from dmcvb_gen.training.sac import Collector, CriticEnsemble, Learner, ReplaySettings, check_replay, network
+from dmcvb_gen.training.sac import Collector, CriticEnsemble, Learner, ReplaySettings, check_replay, in_order, network
 from dmcvb_gen.training.settings import Count, Positive
 
 __all__ = ["Mpo", "Settings", "check", "network", "train"]
@@ -103,8 +103,9 @@ class Mpo(Learner):
 
     def __init__(self, header: PolicyHeader, settings: Settings, seed: int):
         super().__init__(header, settings, seed)
-        sizes = (header.observation_size, header.action_size, settings.critic_hidden, settings.critics)
-        self.critic, self.target_actor = CriticEnsemble(*sizes), copy.deepcopy(self.actor)
+        inputs = header.observation_size + header.action_size
+        self.critic = CriticEnsemble(inputs, settings.critic_hidden, settings.critics)
+        self.target_actor = copy.deepcopy(self.actor)
         self.target = copy.deepcopy(self.critic)
         for target in (self.target, self.target_actor):
             target.requires_grad_(False)
@@ -153,11 +154,9 @@ class Mpo(Learner):
 
     def update(self, batch: dict[str, torch.Tensor]) -> None:
         """One gradient step."""
-        names = ("observation", "action", "reward", "discount", "next_observation")
-        batch = batch | {"reward": batch["reward"] * self.settings.reward_scale}
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
-        loss, logged = self._loss(*(batch[name] for name in names))
+        loss, logged = self._loss(*in_order(batch, self.settings.reward_scale))
         loss.backward()
         for optimizer in self.optimizers.values():
             optimizer.step()

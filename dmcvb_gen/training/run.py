@@ -48,7 +48,7 @@ from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import useless_setting
 from dmcvb_gen.training.networks import as_arrays, as_tensors
-from dmcvb_gen.training.run_log import RunLog
+from dmcvb_gen.training.run_log import add_row, keep_rows
 from dmcvb_gen.training.settings import algorithm_module, check_settings
 
 EVALUATION_EPISODES = 20
@@ -188,7 +188,6 @@ class Run:
         self.step, self.seconds, self._step_before = 0, 0.0, 0
         self._began = self._last_saved = time.time()
         self._asked_to_stop = False
-        self._log: RunLog | None = None
         self._report: Report = ignore
         self.tick: Callable[[int], Any] = ignore
 
@@ -228,7 +227,7 @@ class Run:
                 )
             self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
             self._drop_later_checkpoints()
-            self._log = RunLog(self.folder, self.step)
+            keep_rows(self.folder, self.step)
             self._began = self._last_saved = time.time()
             with self._stopping_on_signals(stopping):
                 self.algorithm.train(self)
@@ -256,12 +255,13 @@ class Run:
 
     def record(self, weights: Weights, updates: int, metrics: Mapping[str, float]) -> None:
         """Evaluate the actor's `weights`, write them as a checkpoint, log; evaluations are not training time."""
-        assert self._log is not None
         self.seconds += time.time() - self._began
         policy = Policy(self.header, as_arrays(weights), "")
         evaluation, _ = evaluate(policy, self.task, self.evaluation_episodes(), seed=self.step)
         self._write_checkpoint(policy, evaluation)
-        self._log.add(self.step, evaluation, self.seconds, updates, metrics)
+        row = {"step": self.step, "seconds": round(self.seconds, 1), "updates": updates}
+        row |= {"return_mean": evaluation.mean, "return_std": evaluation.std}
+        add_row(self.folder, row | {"success": evaluation.success, "speed": evaluation.speed, **metrics})
         self._report(evaluation)
         self._began = time.time()
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.files import write_text
-from dmcvb_gen.policies.header import Evaluation
 
 LOG = "progress.jsonl"
 
@@ -27,21 +26,14 @@ def read_rows(folder: str | Path) -> list[dict[str, Any]]:
     return rows
 
 
-class RunLog:
-    """Appends to the log of a run that goes on at `step`; what was logged after it is made again."""
+def keep_rows(folder: Path, step: int) -> None:
+    """Drop what was logged after `step`, at which the run goes on: it is made again."""
+    kept = [row for row in read_rows(folder) if row["step"] <= step]
+    write_text(folder / LOG, "".join(json.dumps(row) + "\n" for row in kept))
 
-    def __init__(self, folder: Path, step: int):
-        self._path = folder / LOG
-        kept = [row for row in read_rows(folder) if row["step"] <= step]
-        write_text(self._path, "".join(json.dumps(row) + "\n" for row in kept))
 
-    def add(
-        self, step: int, evaluation: Evaluation, seconds: float, updates: int, metrics: Mapping[str, float]
-    ) -> None:
-        """Log one evaluation, and the learner's own numbers."""
-        row = {"step": step, "seconds": round(seconds, 1), "updates": updates}
-        row |= {"return_mean": evaluation.mean, "return_std": evaluation.std}
-        row |= {"success": evaluation.success, "speed": evaluation.speed, **metrics}
-        known = {name: value for name, value in row.items() if value is not None}
-        with self._path.open("a") as file:
-            file.write(json.dumps(known) + "\n")
+def add_row(folder: Path, row: Mapping[str, float | None]) -> None:
+    """Log one evaluation; numbers that are not known are left out."""
+    known = {name: value for name, value in row.items() if value is not None}
+    with (folder / LOG).open("a") as file:
+        file.write(json.dumps(known) + "\n")

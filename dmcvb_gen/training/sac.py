@@ -278,6 +278,12 @@ class ReplayBuffer(RowBuffer):
         return {name: torch.from_numpy(np.asarray(value)) for name, value in values.items()}
 
 
+def in_order(batch: dict[str, torch.Tensor], reward_scale: float) -> list[torch.Tensor]:
+    """A batch as losses take it: observation, action, scaled reward, discount and next observation."""
+    batch = batch | {"reward": batch["reward"] * reward_scale}
+    return [batch[name] for name in ("observation", "action", "reward", "discount", "next_observation")]
+
+
 # -- critics --------------------------------------------------------------------------------------
 
 
@@ -285,21 +291,16 @@ class CriticEnsemble(nn.Module):
     """Critics of (observation, action), evaluated in one batched product; LayerNorm after each hidden layer.
 
     Args:
+      inputs: numbers of an observation and an action.
       outputs: numbers that a critic gives: the logits of a distribution over returns, or one value.
     """
 
     def __init__(
-        self,
-        observation_size: int,
-        action_size: int,
-        hidden: tuple[int, ...],
-        critics: int = 2,
-        outputs: int = 1,
-        bfloat16: bool = False,
+        self, inputs: int, hidden: tuple[int, ...], critics: int = 2, outputs: int = 1, bfloat16: bool = False
     ):
         super().__init__()
         self.bfloat16 = bfloat16
-        sizes = (observation_size + action_size, *hidden)
+        sizes = (inputs, *hidden)
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         self.scales, self.shifts = nn.ParameterList(), nn.ParameterList()
         for i, o in zip(sizes[:-1], sizes[1:], strict=True):
@@ -372,6 +373,12 @@ class Learner(nn.Module):
             noise[: round(self.settings.greedy_fraction * len(noise))] = 0
             return torch.tanh(mean + std * noise).numpy()
 
+    def descend(self, name: str, loss: torch.Tensor) -> None:
+        """One step of an optimizer down a loss."""
+        self.optimizers[name].zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizers[name].step()
+
     def state(self) -> dict[str, Any]:
         """Everything that learning continues from (tensors and plain numbers)."""
         optimizers = {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()}
@@ -411,7 +418,7 @@ class Sac(Learner):
 
     def __init__(self, header: PolicyHeader, settings: Settings, seed: int):
         super().__init__(header, settings, seed)
-        sizes = (header.observation_size, header.action_size, settings.critic_hidden, settings.critics, BINS)
+        sizes = (header.observation_size + header.action_size, settings.critic_hidden, settings.critics, BINS)
         self.critic, self.target = (CriticEnsemble(*sizes, settings.bfloat16) for _ in range(2))
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
@@ -483,29 +490,17 @@ class Sac(Learner):
     def update(self, batch: dict[str, torch.Tensor]) -> None:
         """One gradient step."""
         settings = self.settings
-        loss = self._critic_loss(
-            batch["observation"],
-            batch["action"],
-            batch["reward"] * (settings.reward_scale or float(self.returns)),
-            batch["discount"],
-            batch["next_observation"],
-        )
-        self.optimizers["critic"].zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimizers["critic"].step()
+        loss = self._critic_loss(*in_order(batch, settings.reward_scale or float(self.returns)))
+        self.descend("critic", loss)
         self._losses["critic_loss"] = loss.detach()
         self.updates += 1
         if self.updates % settings.actor_every == 0:
             self.critic.requires_grad_(False)
             loss, log_prob = self._actor_loss(batch["observation"])
-            self.optimizers["actor"].zero_grad(set_to_none=True)
-            loss.backward()
-            self.optimizers["actor"].step()
+            self.descend("actor", loss)
             self.critic.requires_grad_(True)
             self._losses |= {"actor_loss": loss.detach(), "entropy": -log_prob.detach()}
-            self.optimizers["alpha"].zero_grad(set_to_none=True)
-            (-self.log_alpha.exp() * (log_prob.detach() + self.target_entropy)).backward()
-            self.optimizers["alpha"].step()
+            self.descend("alpha", -self.log_alpha.exp() * (log_prob.detach() + self.target_entropy))
         torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
 
     def metrics(self) -> dict[str, float]:

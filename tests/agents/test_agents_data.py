@@ -39,6 +39,11 @@ def make_data(stack=3, held=(False, True, False), size=SIZE):
     return TrainingData(StepTable(fields, LENGTHS, frames), np.array(held), stack)
 
 
+def pictures_of(data):
+    """(row, channel, size, size) uint8, without the border."""
+    return data.frames.table[..., PAD:-PAD].numpy()
+
+
 def by_hand(pictures, rows, down, right):
     """A stack padded by numpy and cut out."""
     stack = np.concatenate([pictures[row] for row in rows])
@@ -49,13 +54,13 @@ def by_hand(pictures, rows, down, right):
 
 def test_a_stack_is_the_last_frames_with_the_first_one_repeated_under_one_shift():
     data = make_data()
-    pictures = data.frames.pictures.numpy()
+    pictures = pictures_of(data)
     stacks = {0: (0, 0, 0), 1: (0, 0, 1), 2: (0, 1, 2), 5: (5, 5, 5), 6: (5, 5, 6), 12: (10, 11, 12), 14: (13, 13, 14)}
     rows = torch.tensor(list(stacks))
     generator = np.random.default_rng(0)
     down, right = generator.integers(2 * PAD + 1, size=(2, len(rows)))
     down[0], right[0], down[1], right[1] = 0, 8, 8, 0
-    seen = data.observe(rows, torch.from_numpy(down), torch.from_numpy(right)).numpy()
+    seen = data.observe(rows, torch.from_numpy(np.stack([down, right]))).numpy()
     for index, stack in enumerate(stacks.values()):
         np.testing.assert_allclose(seen[index], by_hand(pictures, stack, down[index], right[index]), atol=1e-6)
 
@@ -73,7 +78,7 @@ def test_transitions_are_those_of_training_episodes_and_never_leave_theirs():
 
 
 def test_the_next_observation_is_k_steps_on_under_the_same_shift():
-    data, pictures = make_data(), make_data().frames.pictures.numpy()
+    data, pictures = make_data(), pictures_of(make_data())
     batch = data.batch(64, np.random.default_rng(1), next_observation=True, k=2)
     for index, row in enumerate(batch.reward.long().tolist()):
         shifts = [

@@ -19,6 +19,7 @@ from dmcvb_gen.training.sac import (
     RunningNorm,
     Sac,
     Settings,
+    in_order,
     smoothed,
 )
 
@@ -47,14 +48,9 @@ def batch_of(count=64):
     return {name: torch.tensor(np.asarray(value), dtype=torch.float32) for name, value in values.items()}
 
 
-def batch_in_order(batch):
-    scaled = batch | {"reward": 0.5 * batch["reward"]}
-    return [scaled[name] for name in ("observation", "action", "reward", "discount", "next_observation")]
-
-
 def test_the_ensemble_is_two_separate_critics():
     torch.manual_seed(0)
-    critic = CriticEnsemble(3, 2, (8, 8))
+    critic = CriticEnsemble(5, (8, 8))
     observation, action = torch.randn(5, 3), torch.rand(5, 2)
     both = critic(observation, action)
     for k in range(2):  # each critic by hand
@@ -98,9 +94,9 @@ def test_the_target_follows_by_its_decay():
 def test_a_terminal_transition_does_not_look_ahead():
     sac, batch = learner(), batch_of()
     batch["discount"][:] = 0
-    first = sac.critic_loss(*batch_in_order(batch))
+    first = sac.critic_loss(*in_order(batch, 0.5))
     batch["next_observation"] += 100
-    torch.testing.assert_close(first, sac.critic_loss(*batch_in_order(batch)))
+    torch.testing.assert_close(first, sac.critic_loss(*in_order(batch, 0.5)))
 
 
 @given(target=st.floats(-20, 20), bins=st.integers(11, 201))
@@ -121,7 +117,7 @@ def test_the_loss_is_least_where_critics_give_the_targets_distribution():
     for share in (0.0, 0.9, 1.0):
         logits = (share * wanted + (1 - share) / wanted.shape[1]).clamp(1e-9).log().expand(2, -1, -1)
         sac.critic.forward = lambda observation, action, logits=logits: logits
-        losses.append(float(sac.critic_loss(*batch_in_order(batch))))
+        losses.append(float(sac.critic_loss(*in_order(batch, 0.5))))
     entropy = -(wanted * wanted.clamp(1e-9).log()).sum(1).mean()  # the least that a cross-entropy can be
     assert losses[0] > losses[1] > losses[2] == pytest.approx(2 * float(entropy), rel=1e-3)
 
