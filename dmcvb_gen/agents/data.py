@@ -353,10 +353,7 @@ class TrainingData:
 
     @torch.no_grad()
     def encoded(
-        self,
-        encoder: nn.Module,
-        dtype: torch.dtype = torch.float32,
-        progress: Callable[[float], None] = lambda share: None,
+        self, encoder: nn.Module, dtype: torch.dtype = torch.float32, progress: Callable[[float], None] = ignore
     ) -> TrainingData:
         """The same episodes with the latents of a frozen encoder, computed once; its pictures are not shifted.
 

@@ -118,6 +118,11 @@ def fingerprint(release: Release, budget: Budget, cell: Cell) -> str:
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
+def file_of(out: str | Path, cell: Cell, suffix: str) -> Path:
+    """A file of a cell in a report's folder, e.g. its ".json"."""
+    return Path(out) / ("encoders" if cell.benchmark == ENCODER else "cells") / f"{cell.id}{suffix}"
+
+
 def read_result(path: Path, wanted: str) -> dict[str, Any] | None:
     """A result file, or None if there is none with that fingerprint."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
@@ -168,8 +173,7 @@ class CellRun:
 
     def path(self, suffix: str) -> Path:
         """A file of the cell, e.g. its ".json"."""
-        folder = "encoders" if self.cell.benchmark == ENCODER else "cells"
-        return self.out / folder / f"{self.cell.id}{suffix}"
+        return file_of(self.out, self.cell, suffix)
 
     def result(self) -> dict[str, Any]:
         """Train and score it, unless its result is there.
@@ -454,8 +458,7 @@ def try_cell(
     root: str | Path, out: str | Path, budget: Budget, cell: Cell, tick: ProgressCallback = ignore
 ) -> dict[str, Any]:
     """The result of a cell, its errors as a result."""
-    folder = "encoders" if cell.benchmark == ENCODER else "cells"
-    log = Path(out) / folder / f"{cell.id}.log"
+    log = file_of(out, cell, ".log")
     try:
         result = CellRun(root, out, budget, cell, tick).result()
     except DmcvbError as error:

@@ -137,11 +137,10 @@ class EvaluationScene:
     @classmethod
     def of(cls, subset: Subset, backgrounds: str | None = None) -> EvaluationScene:
         """Return the scene of a subset; `backgrounds`: the videos' folder, if it is not where the manifest says."""
-        choice, source = renderer_choice(subset), video_source(subset.release.path, subset.record, backgrounds)
-        pictures, size = training_pictures(subset), subset.record.size
-        shown = dict(pictures=pictures, size=size, renderer=choice["name"], samples=choice["samples"])
-        repeat = subset.record.action_repeat
-        return cls(subset.task, subset.setting, **shown, backgrounds=source, action_repeat=repeat)
+        record, (renderer, samples) = subset.record, renderer_choice(subset).values()
+        source = video_source(subset.release.path, record, backgrounds)
+        shown = (training_pictures(subset), record.size, renderer, samples, source)
+        return cls(subset.task, subset.setting, *shown, action_repeat=record.action_repeat)
 
     @classmethod
     def parse(cls, where: str, **options: Any) -> EvaluationScene:
@@ -236,7 +235,8 @@ class Evaluator:
         batch = task.batch(count, self.threads)
         starts = self.streams("initial_state")
         state = batch.reset(starts) if self.pair is None else batch.reset_fixed(starts, [self.pair] * count)
-        distance = _distance(task, state)
+        goal = task.state_slices.get("target_vector")
+        distance = None if goal is None else np.linalg.norm(state[:, goal], axis=1)  # meters, in a straight line
         walk, stack, pictures, action = self._walk(), None, [], None
         returns, length = np.zeros(count), np.full(count, self.steps)
         active, ended = np.ones(count, bool), np.zeros(count, bool)
@@ -290,15 +290,7 @@ class Evaluator:
         return stack
 
 
-def _distance(task, state: np.ndarray) -> np.ndarray | None:
-    """(episode,) meters to the goal in a straight line, for tasks that have one."""
-    part = task.state_slices.get("target_vector")
-    return None if part is None else np.linalg.norm(state[:, part], axis=1)
-
-
-def check_actions(
-    actions: Any, shape: tuple[int, int], step: int, low: np.ndarray | float = -1.0, high: np.ndarray | float = 1.0
-) -> np.ndarray:
+def check_actions(actions: Any, shape: tuple[int, int], step: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """(episode, action) float32: the actions of a policy at a step.
 
     Args:

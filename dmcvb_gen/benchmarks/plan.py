@@ -22,7 +22,7 @@ from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.dataset import Release, Subset
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task, read_table
 from dmcvb_gen.registry import Registry
 from dmcvb_gen.spec import (
@@ -91,17 +91,6 @@ BUDGETS = {
         Budget("paper", note="paper: 400k steps, batch 256, 30 episodes every 20k steps, as published"),
     )
 }
-
-
-def get_budget(name: str) -> Budget:
-    """The budget of a name.
-
-    Raises:
-      UnknownNameError: there is none.
-    """
-    if name not in BUDGETS:
-        raise UnknownNameError("profile", name, BUDGETS)
-    return BUDGETS[name]
 
 
 # -- cells ------------------------------------------------------------------------------------------
@@ -414,18 +403,12 @@ class PolicyLearning(Benchmark):
             else:
                 settings, sets = list(dict.fromkeys([*DISTRACTOR_KINDS, *data.settings(task)])), list(self.level_sets)
             for levels in sets:
-                yield from self._set(data, agents, task, settings, levels)
-
-    def _set(self, data: SubsetFinder, agents, task: str, settings: list[str], levels) -> Iterator[Cell]:
-        state_done = False
-        for setting in settings:
-            parts = data.parts(task, levels, setting)
-            if not parts:
-                continue
-            for agent in agents:
-                if not (agent.sees_state and state_done):  # states know of no distractors: one cell serves all
-                    yield Cell(self.name, task, setting, agent, parts)
-            state_done = True
+                found = {setting: data.parts(task, levels, setting) for setting in settings}
+                there = [(setting, parts) for setting, parts in found.items() if parts]
+                for number, (setting, parts) in enumerate(there):
+                    for agent in agents:
+                        if number == 0 or not agent.sees_state:  # states know of no distractors: one cell serves all
+                            yield Cell(self.name, task, setting, agent, parts)
 
     def paper_score(self, cell):
         return paper_score(cell.task, cell.policy_label, cell.setting, cell.agent.paper_name)

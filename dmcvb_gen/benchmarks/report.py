@@ -13,7 +13,7 @@ import io
 import json
 import math
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -166,7 +166,7 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
 # -- facts ------------------------------------------------------------------------------------------
 
 
-def write_report(folder: Path, facts: Mapping[str, Any], results: Results) -> Path:
+def write_report(folder: Path, facts: dict[str, Any], results: Results) -> Path:
     """Write report.html and .json into a folder; gives the path of the page."""
     page = folder / "report.html"
     write_json(page.with_suffix(".json"), facts)
@@ -293,7 +293,7 @@ def rank_correlation(returns: Sequence[np.ndarray], paper: Sequence[float], seed
 # -- the page ---------------------------------------------------------------------------------------
 
 
-def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
+def render_page(facts: dict[str, Any], good: Results, folder: Path) -> str:
     """The page of a report, self-contained.
 
     Args:
@@ -303,23 +303,19 @@ def render_page(facts: Mapping[str, Any], good: Results, folder: Path) -> str:
     loader = PackageLoader("dmcvb_gen.benchmarks", "data")
     jinja = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return jinja.get_template("report.html.jinja").render(
-        **_tables(facts),
+        facts | _tables(facts),
         curves=[figure_url(figure) for figure in curve_figures(good, name)],
         rollouts=_sheets(good, folder, "rollout"),
         decoders=_sheets(good, folder, "decoder"),
         inspection=_inspection(good),
         times=[(result["id"], f"{result['seconds']:.0f}") for result in facts["results"]],
-        seconds=facts["seconds"],
         settings=list(((facts["budget"] if facts["cells_planned"] else {}) | facts["versions"]).items()),
     )
 
 
 def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
     return dict(
-        release=facts["release"],
-        budget=facts["budget"],
         verdict=_verdict(facts),
-        trained=bool(facts["cells_planned"]),
         checks=_checks(facts["structure"]["findings"]),
         incomplete=[(name, *counts) for name, counts in facts["incomplete"].items()],
         findings=_listed(facts["structure"]["findings"]),
@@ -380,26 +376,24 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     """One benchmark's table: a row a task, policy set and setting, a column an agent."""
     results = [result for result in facts["results"] if result["cell"]["benchmark"] == benchmark]
     agents = list(dict.fromkeys(result["cell"]["agent"] for result in results))
-    rows: dict[tuple, dict[str, list[str]]] = {}
-    by_state: dict[tuple, dict[str, list[str]]] = {}
+    scores: dict[tuple, dict[str, list[str]]] = defaultdict(dict)
+    by_state: dict[tuple, dict[str, list[str]]] = defaultdict(dict)
     data: dict[tuple, list[str]] = {}
     for result in results:
         cell = result["cell"]
         key = (task_folder(cell["task"]), result["labels"]["policy"], cell["setting"])
         data[key] = [_number(result["data"]["mean"]), *_goal_lines(result["data"])]
-        rows.setdefault(key, {})[cell["agent"]] = lines = _score_lines(result, facts["budget"])
+        scores[key][cell["agent"]] = lines = _score_lines(result, facts["budget"])
         if parse_agent(cell["agent"]).sees_state:
-            by_state.setdefault(key[:2], {})[cell["agent"]] = lines
-    for key, row in rows.items():  # states know of no distractors: one score stands beside those of every setting
-        rows[key] = by_state.get(key[:2], {}) | row
-    return {
-        "title": BENCHMARKS.get(benchmark).title,
-        "head": ("task", "policy learns from", "setting", "the data's own", *agents),
-        "rows": [
-            {"facts": key, "data": data[key], "scores": [row.get(agent) for agent in agents]}
-            for key, row in rows.items()
-        ],
-    }
+            by_state[key[:2]][cell["agent"]] = lines
+    rows = []
+    for key, known in scores.items():
+        known = (
+            by_state[key[:2]] | known
+        )  # states know of no distractors: one score stands beside those of every setting
+        rows.append({"facts": key, "data": data[key], "scores": [known.get(agent) for agent in agents]})
+    head = ("task", "policy learns from", "setting", "the data's own", *agents)
+    return {"title": BENCHMARKS.get(benchmark).title, "head": head, "rows": rows}
 
 
 def _score_lines(result: Mapping[str, Any], budget: Mapping[str, Any]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Lt
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.options import Count, Local, Location, Names, Precision, checked, progress_bar, refuse
 from dmcvb_gen.parallel import Workers, ignore
 from dmcvb_gen.spec import matches
@@ -159,14 +159,16 @@ def _budget(profile, scale, workers, threads, device, precision, memory, **field
     """
     import torch
 
-    from dmcvb_gen.benchmarks.plan import get_budget
+    from dmcvb_gen.benchmarks.plan import BUDGETS
     from dmcvb_gen.parallel.cores import usable_cores
     from dmcvb_gen.precision import choose_precision
 
+    if profile not in BUDGETS:
+        raise UnknownNameError("profile", profile, BUDGETS)
     if device == "cuda" and not torch.cuda.is_available():
         raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
     return dataclasses.replace(
-        get_budget(profile).scaled(scale),
+        BUDGETS[profile].scaled(scale),
         device=device,
         precision=choose_precision(precision, device),
         threads=threads or (max(1, usable_cores() // workers) if isinstance(workers, int) else 1),

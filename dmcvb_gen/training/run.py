@@ -34,7 +34,7 @@ import torch
 
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import remove_partial, sha256_file, write_bytes, write_json
+from dmcvb_gen.files import remove_partial, sha256_file, write_bytes, write_json, write_text
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import checkpoints
@@ -48,9 +48,9 @@ from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training.episodes import useless_setting
 from dmcvb_gen.training.networks import as_arrays, as_tensors
-from dmcvb_gen.training.run_log import add_row, keep_rows
 from dmcvb_gen.training.settings import algorithm_module, check_settings
 
+LOG = "progress.jsonl"
 EVALUATION_EPISODES = 20
 """Episodes of an evaluation along the way, at most; selection evaluates its picks again on 100."""
 EVALUATION_STEPS = {LOCOMOTION: 8.0, ANT_MAZE: 4.0}
@@ -96,8 +96,7 @@ class Stopped(DmcvbError):
 def command_of(config: RunConfig) -> str:
     """The command line that trains this run again."""
     parts = [f"dmcvb-gen train-behaviour {shlex.quote(config.task)} --algo {config.algorithm} --steps {config.steps}"]
-    parts.append(f"--seed {config.seed}")
-    parts.append(f"--evaluate-every {config.evaluate_every}")
+    parts += [f"--seed {config.seed}", f"--evaluate-every {config.evaluate_every}"]
     if config.init_from:
         parts.append(f"--init-from {shlex.quote(config.init_from)}")
     pairs = (f"{name}={json.dumps(value)}" for name, value in sorted(config.settings.items()))
@@ -131,6 +130,19 @@ def read_state(folder: str | Path) -> dict[str, Any] | None:
     """
     path = Path(folder) / "resume" / STATE
     return read_state_file(path, "start over with another --out") if path.exists() else None
+
+
+def read_rows(folder: str | Path) -> list[dict[str, Any]]:
+    """The lines of a run's log; without one that a killed process left half written, or that is being written.
+
+    A line has step (agent steps), seconds (of training), updates (of gradients), return_mean and return_std, of mazes
+    success and speed, and the learner's own numbers.
+    """
+    path, rows = Path(folder) / LOG, []
+    for line in path.read_text().splitlines() if path.exists() else ():
+        with contextlib.suppress(ValueError):
+            rows.append(json.loads(line))
+    return rows
 
 
 def check_same(folder: Path, found: RunConfig, asked: RunConfig) -> None:
@@ -226,8 +238,7 @@ class Run:
                     "another --out"
                 )
             self.step, self.seconds = (saved["step"], saved["seconds"]) if saved else (0, 0.0)
-            self._drop_later_checkpoints()
-            keep_rows(self.folder, self.step)
+            self._drop_what_came_later()
             self._began = self._last_saved = time.time()
             with self._stopping_on_signals(stopping):
                 self.algorithm.train(self)
@@ -261,7 +272,9 @@ class Run:
         self._write_checkpoint(policy, evaluation)
         row = {"step": self.step, "seconds": round(self.seconds, 1), "updates": updates}
         row |= {"return_mean": evaluation.mean, "return_std": evaluation.std}
-        add_row(self.folder, row | {"success": evaluation.success, "speed": evaluation.speed, **metrics})
+        row |= {"success": evaluation.success, "speed": evaluation.speed, **metrics}
+        with (self.folder / LOG).open("a") as file:
+            file.write(json.dumps({name: value for name, value in row.items() if value is not None}) + "\n")
         self._report(evaluation)
         self._began = time.time()
 
@@ -308,7 +321,9 @@ class Run:
         facts = {"agent_step": self.step, "evaluation": evaluation, "training": trained}
         save_policy(self._checkpoint(self.step), policy.header.model_copy(update=facts), policy.weights)
 
-    def _drop_later_checkpoints(self) -> None:
+    def _drop_what_came_later(self) -> None:
+        kept = [row for row in read_rows(self.folder) if row["step"] <= self.step]
+        write_text(self.folder / LOG, "".join(json.dumps(row) + "\n" for row in kept))
         for step, path in checkpoints(self.folder).items():
             if step > self.step:
                 path.unlink()

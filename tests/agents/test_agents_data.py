@@ -259,11 +259,6 @@ def test_the_curve_has_losses_hold_out_and_scores(monkeypatch):
     assert curve[-1]["loss"] < curve[0]["loss"]
 
 
-def pixel_learner(data):
-    torch.manual_seed(0)
-    return BehaviorCloning(observation_encoder(data.channels, SIZE), data.sizes)
-
-
 def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to(monkeypatch):
     monkeypatch.setattr(trainer, "TICK_SECONDS", -1.0)
     data, rates = make_data().states_only(), {True: [], False: []}

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from dmcvb_gen.agents.data import Slice, load_data
@@ -31,14 +30,13 @@ from dmcvb_gen.benchmarks.checks import (
 from dmcvb_gen.benchmarks.plan import BUDGETS, goal_cells, only, plan_benchmark
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, _tables, curve_figures, render_page
 from dmcvb_gen.benchmarks.validate import validate
-from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import PolicyRecord, record_path
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
-from tests.conftest import TINY_MAZE, maze_recipe, rewrite, roll_out, small_recipe
+from tests.conftest import TINY_MAZE, invoke, maze_recipe, rewrite, roll_out, small_recipe
 
 NAME = "walker-walk/expert/dynamic"
 
@@ -65,10 +63,6 @@ def set_rows(array, episode, step, value):
         group[array][episode] = rows
 
     return change
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def found(folder):
@@ -106,12 +100,11 @@ def report(release, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
     arguments = ("validate", release, "--profile=smoke", "--agents=bc,state-bc,id+bc", "--workers=1", "--threads=1")
     arguments += (f"--out={out}",)
-    return arguments, out, run(*arguments)
+    return arguments, out, invoke(*arguments, code=0)
 
 
 def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     _, out, result = report
-    assert result.exit_code == 0, result.output
     scores = [line for line in result.output.splitlines() if " [smoke]" in line]
     assert len(scores) == 3 and "paper 9" not in result.output, "noise is not set beside the paper's numbers"
     assert "b1: not in the release: walker-walk/expert/none" in result.output
@@ -267,16 +260,15 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--only", "cheetah-run/*"), NAME),
         ((tmp_path,), "no release"),
     ):
-        result = run("validate", *arguments, "--out", tmp_path / "out")
-        assert result.exit_code == 2 and message in result.output, result.output
+        result = invoke("validate", *arguments, "--out", tmp_path / "out", code=2)
+        assert message in result.output, result.output
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_a_damaged_release_ends_with_1_names_the_place_and_is_not_trained_on(copy, tmp_path):
     rewrite(copy, NAME, set_rows("state", 1, (123, 4), np.nan))
-    result = run("validate", copy, "--agents", "state-bc", "--out", tmp_path / "out")
-    assert result.exit_code == 1
+    result = invoke("validate", copy, "--agents", "state-bc", "--out", tmp_path / "out", code=1)
     assert f"FAIL finite: {NAME}, episode 1, step 123" in result.output
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Checks failed: 1 finding" in page and "0 of 1 benchmark cells run" in page
@@ -285,8 +277,8 @@ def test_a_damaged_release_ends_with_1_names_the_place_and_is_not_trained_on(cop
 def test_a_folder_that_cannot_be_written_is_refused_before_any_work(release, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("dmcvb_gen.benchmarks.checks.check_structure", lambda *_: pytest.fail("work was done"))
-    result = run("validate", release, "--out", tmp_path / "file" / "report")
-    assert result.exit_code == 2 and "choose another --out" in result.output
+    result = invoke("validate", release, "--out", tmp_path / "file" / "report", code=2)
+    assert "choose another --out" in result.output
 
 
 @pytest.mark.slow
@@ -297,8 +289,7 @@ def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
     shutil.rmtree(part / "records" / "walker-walk" / "random" / "dynamic")
     for path in [part / "manifest.json", *part.rglob("zarr.json")]:
         path.unlink()  # as a rollout is left in the middle
-    result = run("validate", part, "--checks-only", "--out", tmp_path / "out")
-    assert result.exit_code == 1, result.output
+    result = invoke("validate", part, "--checks-only", "--out", tmp_path / "out", code=1)
     assert "All checks passed" in result.output and "Incomplete: 5 of 9 episodes." in result.output
     facts = json.loads((tmp_path / "out" / "report.json").read_text())
     assert facts["sound"] and not facts["complete"]
@@ -308,19 +299,13 @@ def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
 
 @pytest.mark.slow
 def test_imported_data_are_checked_trained_on_and_evaluated_by_our_renderer(small_release, tmp_path):
-    exported = run(
-        *("export", small_release, "--only", "walker-walk/random/dynamic", "--to", "rlds", "--out", tmp_path / "rlds")
-    )
-    assert exported.exit_code == 0, exported.output
+    only_dynamic = ("--only", "walker-walk/random/dynamic")
+    invoke("export", small_release, *only_dynamic, "--to", "rlds", "--out", tmp_path / "rlds", code=0)
     [features] = (tmp_path / "rlds").rglob("features.json")
     shutil.copytree(features.parent, tmp_path / "locomotion/walker_walk/random/dynamic_medium")
-    imported = run("import", tmp_path / "locomotion", "--out", tmp_path / "release")
-    assert imported.exit_code == 0, imported.output
-    result = run(
-        *("validate", tmp_path / "release", "--agents", "bc,state-bc", "--threads", 1),
-        *("--out", tmp_path / "out"),
-    )
-    assert result.exit_code == 0, result.output
+    invoke("import", tmp_path / "locomotion", "--out", tmp_path / "release", code=0)
+    options = ("--agents", "bc,state-bc", "--threads", 1, "--out", tmp_path / "out")
+    invoke("validate", tmp_path / "release", *options, code=0)
     facts = json.loads((tmp_path / "out" / "report.json").read_text())
     assert facts["sound"] and {r["cell"]["agent"] for r in facts["results"]} == {"bc", "state-bc"}
     assert "The data were rendered elsewhere (imported)" in (tmp_path / "out" / "report.html").read_text()
@@ -357,8 +342,8 @@ def test_returns_that_cannot_be_read_cost_no_report(small_mazes, tmp_path):
     names = list(Release.open(folder).subsets)
     flip(file_of(folder, names[0], "return", 0))
     rewrite(folder, names[1], lambda group: group["return"].__setitem__(0, np.nan))
-    result = run("validate", folder, "--checks-only", "--out", tmp_path / "out")
-    assert result.exit_code == 1 and f"FAIL files: {names[0]}" in result.output, result.output
+    result = invoke("validate", folder, "--checks-only", "--out", tmp_path / "out", code=1)
+    assert f"FAIL files: {names[0]}" in result.output, result.output
     assert f"FAIL returns: {names[1]}, episode 0" in result.output, result.output
     facts = json.loads((tmp_path / "out/report.json").read_text())
     assert list(facts["returns"]) == names[1:]
@@ -478,12 +463,11 @@ def test_the_cells_of_a_goal_pair_are_those_of_the_rollout(small_mazes):
 def maze_report(small_mazes, tmp_path_factory):
     out = tmp_path_factory.mktemp("maze-report")
     command = ["validate", str(small_mazes), "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
-    return out, CliRunner().invoke(main, [*command, "--workers", "1", "--threads", "1", "--out", str(out)])
+    return out, invoke(*command, "--workers", 1, "--threads", 1, "--out", out, code=0)
 
 
 def test_a_maze_release_goes_through_b1_and_b3(maze_report):
     out, result = maze_report
-    assert result.exit_code == 0, result.output
     facts = json.loads((out / "report.json").read_text())
     ran = [(r["cell"]["benchmark"], r["cell"]["agent"], r["labels"]["policy"]) for r in facts["results"]]
     assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | {

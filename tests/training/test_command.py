@@ -11,10 +11,8 @@ import click
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 from dmcvb_gen import progress
-from dmcvb_gen.cli import main
 from dmcvb_gen.cli.behaviours import train_behaviour
 from dmcvb_gen.own_code import TASKS
 from dmcvb_gen.policies.bundled import bundled_levels, bundled_policies
@@ -25,6 +23,7 @@ from dmcvb_gen.training import behaviour
 from dmcvb_gen.training.behaviour import plan_of, run_config
 from dmcvb_gen.training.run import Run, RunConfig, command_of
 from dmcvb_gen.training.settings import default_run, parse_settings
+from tests.conftest import invoke
 
 
 @pytest.mark.parametrize("init_from", [None, "runs/my stand run"])
@@ -62,15 +61,13 @@ def test_what_goes_unheard_or_is_not_there_is_refused_before_any_work(tmp_path):
         (["evaluate-behaviour", "--behaviour", tmp_path / "nothere"], "neither a policy file, a run folder nor"),
         (["train-behaviour", "walker-walk", "--resume", "--out", tmp_path / "none"], "holds no run to resume"),
     ):
-        result = CliRunner().invoke(main, [*map(str, arguments)])
-        assert result.exit_code == 2 and words in result.output and result.output.count("\n") == 1, result.output
+        result = invoke(*arguments, code=2)
+        assert words in result.output and result.output.count("\n") == 1, result.output
     assert not list(tmp_path.iterdir())
 
 
 def evaluated(*arguments):
-    result = CliRunner().invoke(main, ["evaluate-behaviour", *map(str, arguments)])
-    assert result.exit_code == 0, result.output
-    return result.output
+    return invoke("evaluate-behaviour", *arguments, code=0).output
 
 
 @pytest.mark.slow
@@ -97,13 +94,10 @@ def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
     (file,) = bundled_policies("walker-walk", "medium")
     (row,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--json"))
     assert (row["task"], row["level"], row["mode"]) == ("walker-walk", "medium", "mean")
-    folder = json.loads(
-        evaluated("walker-walk", "--behaviour", file.parent, "--level", "medium", "--episodes", 2, "--json")
-    )
+    short = ("--level", "medium", "--episodes", 2, "--json")
+    folder = json.loads(evaluated("walker-walk", "--behaviour", file.parent, *short))
     assert folder[0]["returns"] == row["returns"]
-    both = json.loads(
-        evaluated("--behaviour", file, "--level", "random", "--level", "medium", "--episodes", 2, "--json")
-    )
+    both = json.loads(evaluated("--behaviour", file, "--level", "random", *short))
     assert [one["level"] for one in both] == ["random", "medium"] and both[1]["returns"] == row["returns"]
     assert both[0]["returns"]["mean"] < row["returns"]["mean"] / 2
     table = evaluated("--behaviour", file, "--episodes", 2)
@@ -122,8 +116,7 @@ def test_a_task_without_a_setting_of_its_own_goes_from_nothing_to_data(tmp_path)
         ["rollout", "acrobot-swingup", *behaviour, *small],
         ["verify", str(tmp_path / "data")],
     ):
-        done = CliRunner().invoke(main, command)
-        assert done.exit_code == 0, done.output
+        invoke(*command, code=0)
 
 
 POLICY = str(bundled_policies("walker-walk", "expert")[0])
@@ -161,8 +154,8 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
     ],
 )
 def test_bad_commands_say_what_is_wrong(tmp_path, arguments, words):
-    result = CliRunner().invoke(main, ["train-behaviour", *arguments, "--out", str(tmp_path / "run")])
-    assert result.exit_code == 2 and words in result.output and not (tmp_path / "run").exists()
+    result = invoke("train-behaviour", *arguments, "--out", tmp_path / "run", code=2)
+    assert words in result.output and not (tmp_path / "run").exists()
     assert len(result.output.strip().splitlines()) == 1 or "Usage" in result.output
 
 

@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 import dmcvb_gen
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.open_maze import open_maze_observation, places
@@ -27,6 +25,7 @@ from dmcvb_gen.training import selection
 from dmcvb_gen.training.guided import Student, base_policy, draw_places
 from dmcvb_gen.training.networks import WaypointNetwork, as_arrays
 from dmcvb_gen.training.run import RunConfig, open_run
+from tests.conftest import invoke
 
 
 def config(task="ant-maze-easy7x7a", steps=640, **changes):
@@ -62,12 +61,8 @@ def test_headed_is_what_an_ant_in_the_middle_of_an_open_maze_sees():
     physics[:, goal : goal + 2] = vector
     other.set_physics(physics)
     ends = np.cumsum([FIELDS[name] for name in BEHAVIOUR_FIELDS])[:-1]
-    for name, ours, theirs in zip(
-        BEHAVIOUR_FIELDS,
-        np.split(seen, ends, axis=1),
-        np.split(other.behaviour_observation(), ends, axis=1),
-        strict=True,
-    ):
+    fields = (np.split(values, ends, axis=1) for values in (seen, other.behaviour_observation()))
+    for name, ours, theirs in zip(BEHAVIOUR_FIELDS, *fields, strict=True):
         if name != "sensors_touch":  # there are no walls to touch
             np.testing.assert_allclose(ours, theirs, atol=2e-5, err_msg=name)
 
@@ -110,13 +105,10 @@ def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
 
     place = draw_places(run.task.layout, np.random.default_rng(9), 500)
     told = torch.from_numpy(headings(run.task.layout, place[:, :2], place[:, 2:], AHEAD))
-    errors = []
-    for weights in (
-        WaypointNetwork(header.way).state_dict(),
-        {n[4:]: torch.tensor(v) for n, v in policy.weights.items()},
-    ):
-        way = WaypointNetwork(header.way)
-        way.load_state_dict({name: value for name, value in weights.items() if name in way.state_dict()})
+    way, errors = WaypointNetwork(header.way), []
+    learned = {name: torch.tensor(policy.weights[f"way.{name}"]) for name in way.state_dict()}
+    for weights in (way.state_dict(), learned):
+        way.load_state_dict(weights)
         with torch.no_grad():
             errors.append(float(((way(torch.from_numpy(place)) - told) ** 2).sum(1).mean()))
     assert errors[1] < 0.5 * errors[0]
@@ -168,8 +160,7 @@ def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, 
     assert len(commands) <= 6
     for command in commands:
         short = {"train-behaviour": SHORT, "rollout": "--size 16 --max-steps 50"}.get(command[0], "").split()
-        done = CliRunner().invoke(main, [*command, *short])
-        assert done.exit_code == 0, (command, done.output)
+        done = invoke(*command, *short, code=0)
         assert "***" not in done.output  # messages have the maze's name, not its rows
     release = dmcvb_gen.open(str(in_folder / "ring"))
     assert sorted(name.split("/")[1] for name in release) == ["expert", "medium"]
@@ -186,13 +177,13 @@ def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, 
 )
 def test_a_maze_that_cannot_be_learned_is_one_line(in_folder, rows, message):
     (in_folder / "bad.txt").write_text(rows)
-    done = CliRunner().invoke(main, ["train-behaviour", "--layout", "bad.txt"])
-    assert done.exit_code == 2 and re.search(message, done.output) and done.output.count("\n") == 1
+    done = invoke("train-behaviour", "--layout", "bad.txt", code=2)
+    assert re.search(message, done.output) and done.output.count("\n") == 1
     assert not os.path.exists("runs")
 
 
 def test_a_task_and_a_layout_are_one_too_many(in_folder):
     (in_folder / "hall.txt").write_text(HALL)
     for arguments in ([], ["walker-walk", "--layout", "hall.txt"]):
-        done = CliRunner().invoke(main, ["train-behaviour", *arguments])
-        assert done.exit_code == 2 and "give a TASK, or the file of a maze with --layout" in done.output
+        done = invoke("train-behaviour", *arguments, code=2)
+        assert "give a TASK, or the file of a maze with --layout" in done.output

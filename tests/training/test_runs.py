@@ -26,8 +26,7 @@ from dmcvb_gen.training import run as runs
 from dmcvb_gen.training.behaviour import run_config, train_behaviour
 from dmcvb_gen.training.episodes import standing_states
 from dmcvb_gen.training.networks import Actor, as_arrays
-from dmcvb_gen.training.run import Run, RunConfig, Stopped, check_same, open_run
-from dmcvb_gen.training.run_log import LOG, read_rows
+from dmcvb_gen.training.run import LOG, Run, RunConfig, Stopped, check_same, open_run, read_rows
 from dmcvb_gen.training.settings import default_run
 
 SAC = dict(warmup_steps=24, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4)

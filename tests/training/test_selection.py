@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
-from dmcvb_gen.cli import main
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.own_code import TASKS
 from dmcvb_gen.policies.actor import random_policy
@@ -25,7 +23,7 @@ from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import selection
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.selection import MIXED_COUNT, converge, pick_checkpoints, read_curve, select_checkpoints
-from tests.conftest import TINY_MAZE
+from tests.conftest import TINY_MAZE, invoke
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -92,11 +90,7 @@ def test_expert_is_the_first_at_95_percent_of_the_way_and_medium_lies_at_half(gi
         (np.linspace(10, 1000, 100), "expert", "still rises"),
         (rising()[:1], "expert", "1 evaluation, at least 2 are needed"),
         (np.full(100, -3.0), "medium", "never rose"),
-        (
-            np.concatenate([np.full(30, 20.0), np.full(70, 1000.0)]),
-            "mixed",
-            "evaluate more often",
-        ),  # jumps over the half
+        (np.repeat([20.0, 1000.0], [30, 70]), "mixed", "evaluate more often"),  # jumps over the half
     ],
 )
 def test_what_cannot_be_picked_says_why(returns, level, words):
@@ -176,9 +170,7 @@ def run_folder(tmp_path):
 
 
 def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_folder):
-    result = CliRunner().invoke(main, ["select-checkpoints", str(run_folder), "--episodes", "3", "--json"])
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.output)
+    found = json.loads(invoke("select-checkpoints", run_folder, "--episodes", 3, "--json", code=0).output)
     assert found["convergence"]["converged"] and found["convergence"]["value"] == pytest.approx(6)
     assert all(pick["evaluation"]["mode"] == "mean" for level in found["levels"].values() for pick in level["picks"])
     assert json.loads((run_folder / "selection.json").read_text()) == found
@@ -190,15 +182,11 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
             header = read_header(path)
             assert header.level == level and header.evaluation.episodes == 3
             assert header.agent_step == pick["step"] and header.evaluation.mean == pick["evaluation"]["mean"]
-            assert header.training["selection"] == {
-                "target": pick["target"],
-                "convergence": round(found["convergence"]["value"], 2),
-            }
-            points = read_curve(run_folder)
-            assert header.training["curve"] == {
-                "steps": [step for step, _, _ in points],
-                "returns": [round(value, 2) for _, value, _ in points],
-            }
+            value = round(found["convergence"]["value"], 2)
+            assert header.training["selection"] == {"target": pick["target"], "convergence": value}
+            steps, returns, _ = zip(*read_curve(run_folder), strict=True)
+            curve = {"steps": list(steps), "returns": [round(value, 2) for value in returns]}
+            assert header.training["curve"] == curve
 
 
 def test_the_way_begins_at_random_actions_only_where_returns_may_be_negative():
@@ -251,12 +239,11 @@ def cost_task(tmp_path, monkeypatch):
 def test_the_command_after_the_training_of_an_own_task_can_be_run_as_it_is(cost_task, monkeypatch):
     cut = {"warmup_steps": 10, "simulations": 2, "batch_size": 4, "compile": False, "bfloat16": False}
     words = [word for name, value in cut.items() for word in ("--set", f"{name}={value}")]
-    trained = CliRunner().invoke(main, ["train-behaviour", cost_task, "--steps", "12", "--out", "run", *words])
-    assert trained.exit_code == 0, trained.output
+    trained = invoke("train-behaviour", cost_task, "--steps", 12, "--out", "run", *words, code=0)
     [line] = [line for line in trained.output.splitlines() if line.startswith("Next: ")]
     leave, program, *arguments = shlex.split(line.removeprefix("Next: "))
     assert (leave, program) == (f"{TASKS}={cost_task}", "dmcvb-gen")
     get_task.cache_clear()  # as in a new process
     monkeypatch.setenv(TASKS, leave.removeprefix(f"{TASKS}="))
-    selected = CliRunner().invoke(main, [*arguments, "--episodes", "2"])
-    assert selected.exit_code == 1 and "at least 2 are needed" in " ".join(selected.output.split()), selected.output
+    selected = invoke(*arguments, "--episodes", 2, code=1)
+    assert "at least 2 are needed" in " ".join(selected.output.split()), selected.output
