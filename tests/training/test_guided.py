@@ -12,7 +12,6 @@ import pytest
 import torch
 
 import dmcvb_gen
-from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.open_maze import open_maze_observation, places
 from dmcvb_gen.policies.policy_file import load_policy, read_header
@@ -112,14 +111,6 @@ def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
         with torch.no_grad():
             errors.append(float(((way(torch.from_numpy(place)) - told) ** 2).sum(1).mean()))
     assert errors[1] < 0.5 * errors[0]
-
-
-def test_what_cannot_be_guided(tmp_path):
-    with pytest.raises(DmcvbError, match="for ant mazes"):
-        open_run(tmp_path / "run", config(task="walker-walk"), False)
-    with pytest.raises(DmcvbError, match="unknown setting of guided"):
-        open_run(tmp_path / "run", config(settings={"path_reward_scale": 1.0}), False)
-    assert not (tmp_path / "run").exists()
 
 
 # -- a maze of one's own ----------------------------------------------------------------------------

@@ -97,13 +97,10 @@ def assert_same_run(first, second):
     assert curves[0] == curves[1]
 
 
-@pytest.mark.slow_cases("maze", "guided", "mpo", "sb3")
-@pytest.mark.parametrize("case", CASES)
-def test_a_run_leaves_policies_that_say_what_they_are_and_logs_that_tell_the_same(case, tmp_path):
+def assert_policies_say_what_they_are_and_the_log_tells_the_same(run, case):
     task, algorithm, _ = CASES[case]
-    run = train(tmp_path / "run", case=case)
     rows = read_rows(run.folder)
-    assert [row["step"] for row in rows] == names(run) == [80, 160] and rows[1]["seconds"] >= rows[0]["seconds"]
+    assert [row["step"] for row in rows] == [80, 160] and rows[1]["seconds"] >= rows[0]["seconds"]
     for row in rows:
         header = load_policy(run.folder / "checkpoints" / f"{row['step']:010d}.safetensors", get_task(task)).header
         assert header.evaluation.mean == row["return_mean"] and header.agent_step == row["step"]
@@ -138,6 +135,7 @@ def test_a_signal_saves_a_run_that_goes_on_to_the_same_bits_and_a_second_one_doe
     np.random.seed(99), torch.manual_seed(99)  # nothing may come from what this process did before
     resumed = train(tmp_path / "run", True, case=case)
     assert names(resumed) == [40, 80, 160]
+    assert_policies_say_what_they_are_and_the_log_tells_the_same(resumed, case)
     if case in OURS:
         assert_same_run(train(tmp_path / "whole", case=case), resumed)
 
@@ -292,8 +290,6 @@ def test_a_run_folder_is_not_mixed_up(tmp_path):
         open_run(tmp_path / "run", config(), False)
     with pytest.raises(DmcvbError, match="with seed 0, asked for 1"):
         open_run(tmp_path / "run", config(seed=1), True)
-    with pytest.raises(DmcvbError, match="with task 'cheetah-run', asked for 'walker-walk'"):
-        open_run(tmp_path / "run", config(task="walker-walk"), True)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "x").touch()
     with pytest.raises(DmcvbError, match="holds no run"):
@@ -306,13 +302,13 @@ def test_a_resumed_run_keeps_what_is_not_given_and_refuses_what_differs():
     longer = run_config("cheetah-run", "sac", {"discount": 0.99}, found, steps=500, seed=None)
     check_same("runs/x", found, longer)  # naming a default is no difference
     assert longer.steps == 500
-    for changed in (
-        run_config("cheetah-run", "sac", {}, found, seed=5),
-        run_config("cheetah-run", "sac", {"discount": 0.9}, found),
-        run_config("walker-walk", "sac", {}, found),
-        run_config("cheetah-run", "mpo", {}, found),
+    for changed, words in (
+        (run_config("cheetah-run", "sac", {}, found, seed=5), "seed 4, asked for 5"),
+        (run_config("cheetah-run", "sac", {"discount": 0.9}, found), "discount 0.99, asked for 0.9"),
+        (run_config("walker-walk", "sac", {}, found), "task 'cheetah-run', asked for 'walker-walk'"),
+        (run_config("cheetah-run", "mpo", {}, found), "algorithm 'sac', asked for 'mpo'"),
     ):
-        with pytest.raises(DmcvbError, match="holds a run with"):
+        with pytest.raises(DmcvbError, match=f"holds a run with {words}"):
             check_same("runs/x", found, changed)
 
 
@@ -382,21 +378,6 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
     assert len(asked) == 2 and 0.5 * share * 320 < sum(asked) <= share * 320
     assert open_run(tmp_path / "long", config(case, every=10**6), False).evaluation_episodes() == most
     assert share * default_run(CASES[case][0], CASES[case][1])["evaluate_every"] / 600 > 4  # enough to pick medium from
-
-
-@pytest.mark.parametrize(
-    ("task", "setting", "words"),
-    [
-        ("walker-walk", "low_spawn_fraction", "only for ant mazes"),
-        ("cheetah-run", "path_reward_scale", "only for ant mazes"),
-        ("cheetah-run", "shaping", "only for humanoid-walk and ant mazes"),
-        ("fish-swim", "standing_starts", "only for bodies that move freely"),
-    ],
-)
-def test_a_setting_that_the_task_has_no_use_for_begins_no_run(tmp_path, task, setting, words):
-    with pytest.raises(DmcvbError, match=f"setting {setting} is {words}.* remove it"):
-        open_run(tmp_path / "run", config(task=task, settings={setting: 0.01}), False)
-    assert not (tmp_path / "run").exists()
 
 
 def test_standing_states_stand():

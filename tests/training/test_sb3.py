@@ -9,7 +9,6 @@ import torch
 from dm_control import suite
 from stable_baselines3.common.vec_env import VecNormalize
 
-from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import run as runs
@@ -73,13 +72,6 @@ def test_a_resumed_run_has_networks_normalization_and_buffer(tmp_path, models, a
     if algorithm == "sb3:SAC":
         np.testing.assert_array_equal(model.replay_buffer.actions, before.replay_buffer.actions)
         assert (model.replay_buffer.pos, float(model.log_ent_coef)) == (29, float(before.log_ent_coef))
-
-
-def test_it_starts_from_nothing_else(tmp_path):
-    config = RunConfig("cheetah-run", "sb3:SAC", 80, 0, {}, init_from=str(tmp_path / "x.safetensors"))
-    (tmp_path / "x.safetensors").write_bytes(b"")
-    with pytest.raises(DmcvbError, match="--init-from has no effect with --algo sb3:SAC"):
-        open_run(tmp_path / "run", config, False)
 
 
 # -- its episodes: dm_control's numbers, correct ends -----------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import json
 import shlex
@@ -206,43 +205,26 @@ def test_a_folder_that_cannot_be_written_to_is_one_line(run_folder, monkeypatch)
         select_checkpoints(run_folder, episodes=2)
 
 
-COSTS = """
-from dmcvb_gen.tasks.own import mjcf_environment
-
-XML = '''<mujoco><worldbody><light pos="0 0 3"/><camera name="side" pos="0 -2 1"/>
-<body pos="0 0 .8"><joint name="hinge" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 .5 0 0"/></body>
-</worldbody><actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>'''
+BRIEFLY = """
+from dm_control import suite
 
 def push():
-    with open("arm.xml", "w") as file:
-        file.write(XML)
-    return mjcf_environment("arm.xml", cost, time_limit=0.2, control_timestep=0.02)
-
-def cost(physics):
-    return -(1 - physics.data.ctrl[0]) ** 2
+    return suite.load("pendulum", "swingup", task_kwargs=dict(time_limit=0.2))
 """
-"""A task whose every one of ten control steps costs up to 4: the less, the nearer the action is to 1."""
-
-
-@pytest.fixture
-def cost_task(tmp_path, monkeypatch):
-    """Name of an own task with negative returns. Its code is not allowed to run yet."""
-    name = f"costs_{hashlib.sha256(str(tmp_path).encode()).hexdigest()[:8]}"
-    (tmp_path / f"{name}.py").write_text(COSTS)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv(TASKS, "")
-    return f"{name}:push"
 
 
 @pytest.mark.slow
-def test_the_command_after_the_training_of_an_own_task_can_be_run_as_it_is(cost_task, monkeypatch):
+def test_the_command_after_the_training_of_an_own_task_can_be_run_as_it_is(tmp_path, monkeypatch):
+    (tmp_path / "briefly.py").write_text(BRIEFLY)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(TASKS, "")  # its code is not allowed to run yet
     cut = {"warmup_steps": 10, "simulations": 2, "batch_size": 4, "compile": False, "bfloat16": False}
     words = [word for name, value in cut.items() for word in ("--set", f"{name}={value}")]
-    trained = invoke("train-behaviour", cost_task, "--steps", 12, "--out", "run", *words, code=0)
+    trained = invoke("train-behaviour", "briefly:push", "--steps", 12, "--out", "run", *words, code=0)
     [line] = [line for line in trained.output.splitlines() if line.startswith("Next: ")]
     leave, program, *arguments = shlex.split(line.removeprefix("Next: "))
-    assert (leave, program) == (f"{TASKS}={cost_task}", "dmcvb-gen")
+    assert (leave, program) == (f"{TASKS}=briefly:push", "dmcvb-gen")
     get_task.cache_clear()  # as in a new process
     monkeypatch.setenv(TASKS, leave.removeprefix(f"{TASKS}="))
     selected = invoke(*arguments, "--episodes", 2, code=1)
