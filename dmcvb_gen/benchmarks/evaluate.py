@@ -56,6 +56,8 @@ STREAM_NAME = "validate"
 """Name of the evaluation's random streams, from which no release is made."""
 ROUNDING = 1e-5
 """How far an action may leave its bounds before it is refused: what rounding does."""
+SHOTS = 8
+"""Frames of the first episode that a score keeps, about."""
 SPLIT: Split = "val"
 """Split of the videos and maze styles that no data show."""
 
@@ -194,12 +196,11 @@ class Evaluator:
         max_steps: int | None = None,
         backgrounds: str | None = None,
         threads: int = 1,
-        shots: int = 8,
     ):
         scene = EvaluationScene.of(where, backgrounds) if isinstance(where, Subset) else where
         self.scene, self.task = scene, get_task(scene.task).at(scene.action_repeat)
         self.setting = parse_setting(scene.task, scene.setting)[0]
-        self.episodes, self.seed, self.threads, self.shots = episodes, seed, threads, shots
+        self.episodes, self.seed, self.threads = episodes, seed, threads
         self.steps = evaluation_steps(self.task, max_steps)
         self.stack, self.pair, self.renderer, self.videos = stack, pair, None, None
         if pixels:
@@ -244,7 +245,7 @@ class Evaluator:
             observation = {"state": state.astype(np.float32)}
             if walk is not None:
                 stack = self._see(stack, batch.physics(), walk, step, active, action)
-                if step % max(1, self.steps // self.shots) == 0:
+                if step % max(1, self.steps // SHOTS) == 0:
                     pictures.append(stack[0, -1, :3].transpose(1, 2, 0).copy())
                 observation["pixels"] = stack.reshape(count, -1, *stack.shape[3:]).copy()
             given = act(observation)

@@ -31,8 +31,11 @@ def test_a_policy_sees_stacks_and_states_of_all_episodes_at_once(where, channels
     assert len(seen) == 3 and score.limit == 3 and len(score.returns) == 2
     assert seen[0]["pixels"].shape == (2, channels, 16, 16) and seen[0]["pixels"].dtype == np.uint8
     assert seen[0]["state"].shape == (2, task.state_size) and seen[0]["state"].dtype == np.float32
-    half = channels // 3
-    np.testing.assert_array_equal(seen[2]["pixels"][:, half : 2 * half], seen[1]["pixels"][:, 2 * half :])
+    (first, second, third), frame = (each["pixels"] for each in seen), channels // 3
+    np.testing.assert_array_equal(first, np.tile(first[:, :frame], (1, 3, 1, 1)))  # an episode's first one is repeated
+    np.testing.assert_array_equal(third[:, : 2 * frame], second[:, frame:])
+    assert (third[:, 2 * frame :] != second[:, 2 * frame :]).any()  # the newest one is the last
+    assert score.pictures.shape == (3, 16, 16, 3) and score.pictures.std() > 5
     assert score.mean == pytest.approx(np.mean(score.returns))
     again = dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=3, size=16, seed=4, pixels=False)
     assert again.returns == score.returns and set(seen[-1]) == {"state"}
@@ -40,16 +43,18 @@ def test_a_policy_sees_stacks_and_states_of_all_episodes_at_once(where, channels
 
 @pytest.mark.parametrize("where", ["walker-walk/dynamic", "ant-maze-empty7x7/visible"])
 def test_the_split_changes_what_is_seen_and_nothing_else(where):
-    seen = {}
+    seen = []
 
     def policy(observation):
-        seen[split] = observation
+        seen.append(observation)
         return np.zeros((2, get_task(where.split("/")[0]).action_size))
 
-    for split in ("val", "train"):
-        dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=1, size=16, split=split)
-    np.testing.assert_array_equal(seen["val"]["state"], seen["train"]["state"])
-    assert (seen["val"]["pixels"] != seen["train"]["pixels"]).any()
+    for split in ({"split": "val"}, {"split": "train"}, {}):
+        dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=1, size=16, **split)
+    unseen, known, usual = seen
+    np.testing.assert_array_equal(known["state"], unseen["state"])
+    assert (known["pixels"] != unseen["pixels"]).any()
+    np.testing.assert_array_equal(usual["pixels"], unseen["pixels"])
 
 
 @pytest.mark.parametrize("actions, told", [

@@ -65,12 +65,6 @@ def set_rows(array, episode, step, value):
     return change
 
 
-def found(folder):
-    return {
-        (finding.check, finding.episode, finding.step) for finding in check_structure(Release.open(folder)).findings
-    }
-
-
 @pytest.mark.slow_cases("small_mazes", "small_release")
 @pytest.mark.parametrize("whole", ["small_release", "small_mazes"])
 def test_subsets_are_checked_side_by_side_and_only_those_asked_for(whole, tmp_path, request):
@@ -321,26 +315,16 @@ def test_names_are_text_on_the_page(report):
 # -- damage ---------------------------------------------------------------------------------------
 
 
-def file_of(folder, name, array, shard):
-    """Path of an array's file of a shard."""
-    subset = Release.open(folder)[name]
-    layer = next(layer for layer in subset.layers if any(spec.name == array for spec in layer.arrays))
-    return folder / layer.file_path(layer.array(array), shard)
-
-
-def flip(path):
-    """Change one bit in the middle of a file."""
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-
-
 @pytest.mark.slow
 def test_returns_that_cannot_be_read_cost_no_report(small_mazes, tmp_path):
     """Of mazes, whose settings have returns of their own."""
     folder = shutil.copytree(small_mazes, tmp_path / "damaged")
     names = list(Release.open(folder).subsets)
-    flip(file_of(folder, names[0], "return", 0))
+    [layer] = [layer for layer in Release.open(folder)[names[0]].layers if layer.kind == "trajectories"]
+    path = folder / layer.file_path(layer.array("return"), 0)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
     rewrite(folder, names[1], lambda group: group["return"].__setitem__(0, np.nan))
     result = invoke("validate", folder, "--checks-only", "--out", tmp_path / "out", code=1)
     assert f"FAIL files: {names[0]}" in result.output, result.output
@@ -354,7 +338,8 @@ def test_returns_that_cannot_be_read_cost_no_report(small_mazes, tmp_path):
 
 def test_black_pictures_fail_with_their_step_and_frozen_ones_are_a_warning(copy):
     rewrite(copy, NAME, set_rows("pixels", 1, 77, 0))
-    assert ("pictures", 1, 77) in found(copy)
+    findings = check_structure(Release.open(copy)).findings
+    assert ("pictures", 1, 77) in {(one.check, one.episode, one.step) for one in findings}
     rewrite(copy, NAME, lambda group: group["pixels"].__setitem__(1, np.repeat(group["pixels"][1][:1], 501, axis=0)))
     findings, warnings = check_pictures(Release.open(copy)[NAME])
     assert not findings and [(one.check, one.episode) for one in warnings] == [("pictures", 1)]
@@ -459,15 +444,10 @@ def test_the_cells_of_a_goal_pair_are_those_of_the_rollout(small_mazes):
 # -- B1 and B3 ------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def maze_report(small_mazes, tmp_path_factory):
-    out = tmp_path_factory.mktemp("maze-report")
-    command = ["validate", str(small_mazes), "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
-    return out, invoke(*command, "--workers", 1, "--threads", 1, "--out", out, code=0)
-
-
-def test_a_maze_release_goes_through_b1_and_b3(maze_report):
-    out, result = maze_report
+def test_a_maze_release_goes_through_b1_and_b3(small_mazes, tmp_path):
+    command = ["validate", small_mazes, "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
+    out = tmp_path / "out"
+    result = invoke(*command, "--workers", 1, "--threads", 1, "--out", out, code=0)
     facts = json.loads((out / "report.json").read_text())
     ran = [(r["cell"]["benchmark"], r["cell"]["agent"], r["labels"]["policy"]) for r in facts["results"]]
     assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | {
@@ -478,6 +458,11 @@ def test_a_maze_release_goes_through_b1_and_b3(maze_report):
     assert [part["subset"] for part in pretrained["cell"]["pretrain"]] == [f"{MAZE}/hidden"]
     assert not facts["failed"] and not any(r["share"] for r in facts["results"])
     assert "ant-maze-tiny/expert/visible" in result.output  # B1 would have the paper's levels too
+    page, reached = (out / "report.html").read_text(), Release.open(small_mazes)[f"{MAZE}/visible"].read("terminated")
+    [scored] = [r for r in facts["results"] if r["cell"]["agent"] == "state-bc"]
+    assert scored["data"]["success"] == reached.mean() and (scored["data"]["speed"] is None) == (not reached.any())
+    assert scored["score"]["success"] is not None and "success" in page
+    assert "Evaluations are cut at 10 agent steps, the data at 100." in page
 
 
 def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(small_mazes):
@@ -491,15 +476,3 @@ def test_the_datas_speed_is_that_of_the_straight_line_as_the_policies_is(small_m
     score = data_score(subset, data)
     assert score.success == 1
     assert score.speed == pytest.approx((straight / (data.lengths * 2 * task.control_timestep)).mean(), rel=1e-4)
-
-
-def test_maze_scores_have_reward_success_and_speed_beside_the_datas_own(maze_report, small_mazes):
-    facts = json.loads((maze_report[0] / "report.json").read_text())
-    [score] = [r for r in facts["results"] if r["cell"]["agent"] == "state-bc"]
-    subset = Release.open(small_mazes)[f"{MAZE}/visible"]
-    reached = subset.read("terminated")
-    assert score["data"]["success"] == reached.mean() and score["data"]["limit"] == subset.record.max_steps
-    assert (score["data"]["speed"] is None) == (not reached.any())
-    assert score["score"]["success"] is not None and score["score"]["limit"] == 10  # smoke's
-    page = (maze_report[0] / "report.html").read_text()
-    assert "success" in page and "Evaluations are cut at 10 agent steps" in page

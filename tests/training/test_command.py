@@ -141,10 +141,7 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
         (["walker-walk", "--algo", "sb3:RecurrentPPO", "--steps", "80"], "does not accept this"),
         (["walker-walk", "--algo", "sb3:CrossQ", "--steps", "80"], "which is no part of a plain MLP"),
         (["walker-walk", "--algo", "sb3:SAC", "--init-from", POLICY], "--init-from has no effect"),
-        (
-            ["walker-walk", "--set", "critic_hidden=[]"],
-            "setting critic_hidden of sac is []: tuple should have",
-        ),
+        (["walker-walk", "--set", "critic_hidden=[]"], "setting critic_hidden of sac is []: tuple should have"),
         (["walker-walk", "--set", "actor_hidden=[100000]"], "less than or equal to 65536"),
         (["ant-maze-easy7x7a", "--algo", "guided", "--set", "layers=17"], "setting layers of guided is 17"),
         (["walker-walk", "--steps", "0"], "x>=1"),
