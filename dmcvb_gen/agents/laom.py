@@ -30,8 +30,8 @@ class LatentActionObservationModel(LatentActions):
     phi is kept. k is drawn from 1..10. No gradient of the second term reaches f and e.
     """
 
-    needs_later = sample_k = True
-    k_max, decay = 10, 0.999
+    draws = {"next_observation": True, "later": True, "k": 10, "sample_k": True}
+    decay = 0.999
 
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
         super().__init__(encoder, sizes, architecture)

@@ -28,7 +28,7 @@ COMMITMENT, KEEP = 0.05, 0.999
 class LatentActions(Learner):
     """Base: phi beside an inverse model f, which sees two observations through an encoder of its own."""
 
-    needs_next = True
+    draws = {"next_observation": True}
 
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture):
         super().__init__()

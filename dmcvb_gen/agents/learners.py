@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -34,7 +34,7 @@ class Batch:
 
     Attributes:
       observation, next_observation: what the agent sees at t and t + k; None if it is not asked for.
-      later_observation: at t + k, if next_observation is that of t + 1 (`Learner.needs_later`); None elsewhere.
+      later_observation: at t + k, if next_observation is that of t + 1 (`TrainingData.batch`, later); None elsewhere.
       state: (batch, state) normalized state at t.
       action: (batch, action) in [-1, 1].
       reward, discount: (batch,) of the action at t; discount 0 if the task ended the episode.
@@ -91,16 +91,10 @@ class Learner(nn.Module, abc.ABC):
       encoder: phi, if there is one.
     """
 
-    needs_next = False
-    """Whether batches need `next_observation`."""
-    needs_later = False
-    """Whether they need `later_observation`, too."""
-    needs_pictures = True
-    """Whether batches need observations even if they hold the latents of a frozen encoder."""
+    draws: Mapping[str, Any] = {}
+    """How its batches are drawn: next_observation, k, sample_k, later and pictures of `TrainingData.batch`."""
     needs_labels = False
-    """Whether they need `labeled`: it pre-trains an encoder with the actions of the policy's episodes alone."""
-    k_max, sample_k = 1, False
-    """How far off the next observation is."""
+    """Whether batches need `labeled`: it pre-trains an encoder with the actions of the policy's episodes alone."""
     compiled = ("losses",)
     """The methods that torch.compile is worth trying on."""
     pretrains = True

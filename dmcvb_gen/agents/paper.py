@@ -19,7 +19,7 @@ from dmcvb_gen.agents.networks import LATENT, MLP, PAPER, Architecture, Encoder,
 class BehaviorCloning(Policy):
     """BC: || pi(phi(o)) - a ||^2 (equation 3), end to end, or with phi frozen after pre-training."""
 
-    needs_pictures = False
+    draws = {"pictures": False}
     pretrains = True
 
     def __init__(self, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER, frozen: bool = False):
@@ -44,14 +44,13 @@ class InverseDynamics(Learner):
       sample: k is drawn from 1..k and its 64-d linear embedding given to f; else it is the same always.
     """
 
-    needs_next = True
     options = {"k": 1, "sample": False}
 
     def __init__(
         self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER, k: int = 1, sample: bool = False
     ):
         super().__init__()
-        self.encoder, self.k_max, self.sample_k = encoder, k, sample
+        self.encoder, self.draws = encoder, {"next_observation": True, "k": k, "sample_k": sample}
         self.embed_k = initialize(nn.Linear(1, LATENT)) if sample else None
         self.f = MLP(2 * encoder.features + sample * LATENT, sizes.action, tanh=True)
 
@@ -67,7 +66,7 @@ class InverseDynamics(Learner):
 class LatentForwardDynamics(Learner):
     """LFD: || phi_EMA(o_t+1) - g(phi(o_t), e(a_t)) ||^2, phi_EMA an average of phi over time (equation 5)."""
 
-    needs_next = True
+    draws = {"next_observation": True}
 
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
         super().__init__()
@@ -130,7 +129,7 @@ class ObservationProbe(Autoencoder):
 class StateProbe(Learner):
     """|| s - h(phi(o)) ||^2 over an MLP h, phi frozen."""
 
-    needs_pictures = False
+    draws = {"pictures": False}
 
     def __init__(self, encoder: nn.Module, sizes: Sizes):
         super().__init__()

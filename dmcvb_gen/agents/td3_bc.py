@@ -51,8 +51,7 @@ class TD3BC(Policy):
         (none on states) and trunks of their own.
     """
 
-    needs_next = True
-    needs_pictures = False
+    draws = {"next_observation": True, "pictures": False}
     compiled = ("critic_loss", "actor_loss")
     only_learns = ("target.", "net.critic", "updates")
     gamma, noise, noise_clip, actor_every, decay = 0.99, 0.2, 0.5, 2, EMA_DECAY

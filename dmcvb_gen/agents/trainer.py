@@ -121,18 +121,7 @@ def draw(
     """The batch of a step, as the learner needs it; over a batch that is no longer needed, if one is given."""
     generator = np.random.default_rng((seed, step, int(hold_out)))
     common: dict[str, Any] = dict(shift=shift, dtype=torch.bfloat16 if learner.half else torch.float32)
-    batch = data.batch(
-        size,
-        generator,
-        next_observation=learner.needs_next,
-        k=learner.k_max,
-        sample_k=learner.sample_k,
-        later=learner.needs_later,
-        hold_out=hold_out,
-        reuse=reuse,
-        pictures=learner.needs_pictures,
-        **common,
-    )
+    batch = data.batch(size, generator, hold_out=hold_out, reuse=reuse, **learner.draws, **common)
     if not learner.needs_labels or hold_out:
         return batch
     return replace(batch, labeled=data.labeled().batch(size, generator, next_observation=True, **common))
@@ -140,7 +129,7 @@ def draw(
 
 def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) -> dict[str, float]:
     """Losses on held-out episodes, always on the same, at `most` so many batches; {} if nothing is held out."""
-    rows, apart = data.hold_out_rows, learner.k_max if learner.needs_next else 1
+    rows, apart = data.hold_out_rows, learner.draws.get("k", 1)
     if not (rows + apart <= data.end[rows]).any():  # as few or as short episodes as that
         return {}
     sums: dict[str, float] = {}

@@ -178,7 +178,7 @@ def papers_table():
         ("State predictor layer", "output"): ((STATES,), widths(StatePrediction(encoder, paper).h)),
         ("LFD", "decay"): (0.99, forward.decay),
         ("ID", "embedding, steps, sampled"): (
-            (64, 1, False), (identify_k.embed_k.out_features, trained.k_max, trained.sample_k)
+            (64, 1, False), (identify_k.embed_k.out_features, *(trained.draws[name] for name in ("k", "sample_k")))
         ),
         ("TD3-BC", "alpha, discount, frequency, decay"): (
             (2.5, 0.99, 2, 0.99), (td3.alpha, td3.gamma, td3.actor_every, td3.decay)
