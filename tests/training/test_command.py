@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from dmcvb_gen.training import behaviour
 from dmcvb_gen.training.behaviour import plan_of, run_config
 from dmcvb_gen.training.run import Run, RunConfig, command_of
 from dmcvb_gen.training.settings import default_run, parse_settings
-from tests.conftest import invoke
+from tests.conftest import invoke, run, told
 
 
 @pytest.mark.parametrize("init_from", [None, "runs/my stand run"])
@@ -66,18 +65,16 @@ def test_what_goes_unheard_or_is_not_there_is_refused_before_any_work(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def evaluated(*arguments):
-    return invoke("evaluate-behaviour", *arguments, code=0).output
-
-
 @pytest.mark.slow
 def test_mazes_have_scores_of_their_own():
-    assert "to goal m/s" in evaluated("ant-maze-easy7x7a", "walker-walk", "--level", "random", "--episodes", 2)
+    assert "to goal m/s" in run(
+        "evaluate-behaviour", "ant-maze-easy7x7a", "walker-walk", "--level", "random", "--episodes", 2
+    )
 
 
 @pytest.mark.full
 def test_one_command_sets_every_bundled_level_beside_the_paper():
-    rows = json.loads(evaluated("--episodes", 2, "--json"))
+    rows = told("evaluate-behaviour", "--episodes", 2)
     asked = [
         (task, level) for task in task_ids() for level in [*bundled_levels(task), "random"] if bundled_levels(task)
     ]
@@ -92,17 +89,17 @@ def test_one_command_sets_every_bundled_level_beside_the_paper():
 @pytest.mark.slow
 def test_a_policy_file_says_itself_which_task_and_level_it_is_for():
     (file,) = bundled_policies("walker-walk", "medium")
-    (row,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--json"))
+    (row,) = told("evaluate-behaviour", "--behaviour", file, "--episodes", 2)
     assert (row["task"], row["level"], row["mode"]) == ("walker-walk", "medium", "mean")
-    short = ("--level", "medium", "--episodes", 2, "--json")
-    folder = json.loads(evaluated("walker-walk", "--behaviour", file.parent, *short))
+    short = ("--level", "medium", "--episodes", 2)
+    folder = told("evaluate-behaviour", "walker-walk", "--behaviour", file.parent, *short)
     assert folder[0]["returns"] == row["returns"]
-    both = json.loads(evaluated("--behaviour", file, "--level", "random", *short))
+    both = told("evaluate-behaviour", "--behaviour", file, "--level", "random", *short)
     assert [one["level"] for one in both] == ["random", "medium"] and both[1]["returns"] == row["returns"]
     assert both[0]["returns"]["mean"] < row["returns"]["mean"] / 2
-    table = evaluated("--behaviour", file, "--episodes", 2)
+    table = run("evaluate-behaviour", "--behaviour", file, "--episodes", 2)
     assert "DMC-VB paper" in table and "mean actions" in table
-    (drawn,) = json.loads(evaluated("--behaviour", file, "--episodes", 2, "--sample", "--json"))
+    (drawn,) = told("evaluate-behaviour", "--behaviour", file, "--episodes", 2, "--sample")
     assert drawn["mode"] == "sampled" and drawn["returns"] != row["returns"]
 
 

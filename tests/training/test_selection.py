@@ -22,7 +22,7 @@ from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import selection
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.selection import MIXED_COUNT, converge, pick_checkpoints, read_curve, select_checkpoints
-from tests.conftest import TINY_MAZE, invoke
+from tests.conftest import TINY_MAZE, invoke, told
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -169,7 +169,7 @@ def run_folder(tmp_path):
 
 
 def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_folder):
-    found = json.loads(invoke("select-checkpoints", run_folder, "--episodes", 3, "--json", code=0).output)
+    found = told("select-checkpoints", run_folder, "--episodes", 3)
     assert found["convergence"]["converged"] and found["convergence"]["value"] == pytest.approx(6)
     assert all(pick["evaluation"]["mode"] == "mean" for level in found["levels"].values() for pick in level["picks"])
     assert json.loads((run_folder / "selection.json").read_text()) == found
