@@ -388,9 +388,8 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
             by_state[key[:2]][cell["agent"]] = lines
     rows = []
     for key, known in scores.items():
-        known = (
-            by_state[key[:2]] | known
-        )  # states know of no distractors: one score stands beside those of every setting
+        # States know of no distractors: one score stands beside those of every setting.
+        known = by_state[key[:2]] | known
         rows.append({"facts": key, "data": data[key], "scores": [known.get(agent) for agent in agents]})
     head = ("task", "policy learns from", "setting", "the data's own", *agents)
     return {"title": BENCHMARKS.get(benchmark).title, "head": head, "rows": rows}
