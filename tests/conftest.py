@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -78,6 +79,23 @@ def small_release(tmp_path_factory):
     """Folder of a finished small release."""
     folder = tmp_path_factory.mktemp("release") / "small"
     roll_out(small_recipe(), folder)
+    return folder
+
+
+@pytest.fixture
+def copy(small_release, tmp_path):
+    """Folder of a copy of the small release, to change or to damage."""
+    return shutil.copytree(small_release, tmp_path / "copy")
+
+
+@pytest.fixture(scope="session", params=["walker-walk", TINY_MAZE], ids=["walker", "maze"])
+def painted_and_light(request, tmp_path_factory):
+    """A folder with a "painted" release of 3 short episodes a setting, and the same made without images, "light"."""
+    settings = ["visible", "hidden"] if request.param == TINY_MAZE else ["none", "dynamic"]
+    recipe = short_recipe(tasks=request.param, settings=settings, max_steps=6)
+    folder = tmp_path_factory.mktemp("images")
+    for name in ("painted", "light"):
+        roll_out(recipe, folder / name, pixels=name == "painted")
     return folder
 
 

@@ -1,4 +1,4 @@
-"""A web server in a thread, for tests: files of a folder with byte ranges, or answers that a test writes."""
+"""Web servers in threads, for tests: files of a folder with byte ranges, answers that a test writes, and S3."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import contextlib
 import http.server
 import re
 import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
+
+import pytest
 
 
 class Handler(http.server.BaseHTTPRequestHandler):
@@ -67,3 +71,16 @@ def serving(answer):
     finally:
         server.shutdown()
         server.server_close()
+
+
+@contextlib.contextmanager
+def serving_s3(bucket: str) -> Iterator[dict[str, Any]]:
+    """An S3 server with an empty bucket; gives the options that readers and writers need for it."""
+    s3fs = pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    options = {"key": "someone", "secret": "a/very-secret", "client_kwargs": {"use_ssl": False}}
+    options["endpoint_url"] = "http://{}:{}".format(*server.get_host_and_port())
+    s3fs.S3FileSystem(**options, skip_instance_cache=True).mkdir(bucket)
+    yield options
+    server.stop()

@@ -11,6 +11,12 @@ def sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def contents(root: Path) -> dict[str, bytes]:
+    """Path -> bytes of all files of a release, hidden ones and provenance apart."""
+    paths = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in paths.items() if not name.startswith((".", "provenance"))}
+
+
 def check(root: Path) -> dict | None:
     """The manifest in a folder, None if there is none; everything that it names must be there, to the byte.
 

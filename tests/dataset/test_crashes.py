@@ -50,7 +50,7 @@ TABLE: dict[str, tuple[list[Callable], Callable]] = {
     "publish of what grew": ([_rollout], _publish),
 }
 """Name -> commands that ran before, and the command that is killed."""
-TIERS = {"fetch": pytest.mark.slow}
+CASES = [pytest.param(name, marks=pytest.mark.slow if name == "fetch" else pytest.mark.full) for name in TABLE]
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +58,7 @@ def one_writer_of_metadata(monkeypatch):
     monkeypatch.setattr(writer, "READERS", 1)  # writes in one order, so that each has a number
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=TIERS.get(name, pytest.mark.full)) for name in TABLE])
+@pytest.mark.parametrize("name", CASES)
 def test_a_killed_command_leaves_the_older_release_and_is_simply_run_again(tmp_path, name):
     strike_everywhere(tmp_path, name)
 

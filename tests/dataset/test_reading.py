@@ -54,16 +54,6 @@ def test_each_episode_of_a_subset_is_what_reading_it_alone_gives(request, family
                 np.testing.assert_array_equal(values[name], value)
 
 
-def test_the_settings_of_a_seed_share_states_and_rewards_and_differ_in_pixels(small_release):
-    release = Release.open(small_release)
-    none, static, dynamic = (release[f"walker-walk/random/{name}"] for name in ("none", "static", "dynamic"))
-    for name in ("state", "action", "reward", "physics", "length", "seed"):
-        np.testing.assert_array_equal(none.read(name), static.read(name))
-        np.testing.assert_array_equal(none.read(name), dynamic.read(name))
-    assert (none.read("pixels") != static.read("pixels")).mean() > 0.5
-    assert (static.read("pixels") != dynamic.read("pixels")).mean() > 0.3
-
-
 def test_any_selection_gives_what_numpy_gives_and_a_wrong_one_is_no_damage(small_release):
     subset = Release.open(small_release)[NAME]
     stored, whole, mask = subset.array("state"), subset.read("state"), np.array([True, False, True])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 import pickle
 
 import numpy as np
@@ -16,7 +14,6 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import ShardRecord, canonical_json, record_path, shard_size
 from dmcvb_gen.dataset.writer import (
     begin,
-    check_versions,
     finish,
     put_back,
     put_shard,
@@ -35,13 +32,6 @@ def store(tmp_path):
     return open_store(tmp_path / "release")
 
 
-def test_a_release_is_what_its_manifest_names(store):
-    release = made_up.make(store, made_up.recipe(3))
-    text = (store.folder / "manifest.json").read_bytes()
-    assert release.digest == hashlib.sha256(text).hexdigest()
-    assert oracle.check(store.folder) == json.loads(text)
-
-
 def test_readers_get_the_values_that_were_written(store):
     subset = made_up.make(store, made_up.recipe(3))[NAME]
     layers = {spec.name: layer for layer in subset.layers for spec in layer.arrays}
@@ -51,10 +41,6 @@ def test_readers_get_the_values_that_were_written(store):
     assert len(subset) == 3 and subset.steps == subset.read("length").sum()
     landed = pickle.loads(pickle.dumps(subset))
     np.testing.assert_array_equal(landed.read("pixels"), subset.read("pixels"))
-    episodes = dict(subset.each_episode(["pixels", "action", "return"]))
-    assert set(episodes) == {0, 1, 2}
-    for index, episode in episodes.items():
-        assert all((value == subset.episode(index)[name]).all() for name, value in episode.items())
 
 
 def test_readers_take_no_notice_of_zarr_metadata(store):
@@ -88,23 +74,18 @@ def test_growing_keeps_every_file_and_the_older_manifest(store):
 
 
 def test_images_are_added_as_further_layers(store):
-    light = made_up.make(store, made_up.recipe(3, images=False))
+    light = made_up.make(store, made_up.recipe(5, images=False))
     with pytest.raises(StoreError, match="paint"):
         light[NAME].read("pixels")
     assert light[NAME].unpainted.all()
-    painted = made_up.make(store, made_up.recipe(3))
+    part = made_up.make(store, made_up.recipe(2))[NAME]
+    assert len(part) == 5 and list(np.flatnonzero(~part.unpainted)) == [0, 1] and len(part.read("pixels", [0, 1])) == 2
+    with pytest.raises(StoreError, match="without images"):
+        part.array("pixels")[:]
+    painted = made_up.make(store, made_up.recipe(5))
     assert painted.digest != light.digest and not painted[NAME].unpainted.any()
     here = {layer.name: layer.list for layer in light.manifest.layers}
     assert here.items() <= {layer.name: layer.list for layer in painted.manifest.layers}.items()
-
-
-def test_a_subset_has_fewer_images_than_episodes_until_they_are_rendered(store):
-    made_up.make(store, made_up.recipe(5, images=False))
-    subset = made_up.make(store, made_up.recipe(2))[NAME]
-    assert len(subset) == 5 and list(np.flatnonzero(~subset.unpainted)) == [0, 1]
-    assert subset.read("pixels", [0, 1]).shape[0] == 2
-    with pytest.raises(StoreError, match="without images"):
-        subset.array("pixels")[:]
 
 
 GROWTHS = [made_up.recipe(2), made_up.recipe(5), made_up.recipe(4, ["none"]), made_up.recipe(3, images=False)]
@@ -119,20 +100,17 @@ def test_growths_in_any_order_give_one_manifest_and_asking_for_less_changes_none
 
 
 REFUSED = {
-    "another seed": (made_up.TRAJECTORIES.model_copy(update={"makes": {"seed": 2}}), "seed 1, asked for 2"),
-    "another shard size": (
-        made_up.TRAJECTORIES.model_copy(update={"episodes_per_shard": 3}),
-        "episodes_per_shard 2, asked",
-    ),
+    "another seed": ({"makes": {"seed": 2}}, "seed 1, asked for 2"),
+    "another shard size": ({"episodes_per_shard": 3}, "episodes_per_shard 2, asked"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_recipe_that_contradicts_the_release_changes_nothing(store, name):
-    layer, message = REFUSED[name]
+    changes, message = REFUSED[name]
     made_up.make(store, made_up.recipe(2))
     before = store.list()
-    wanted = made_up.recipe(4)
+    wanted, layer = made_up.recipe(4), made_up.TRAJECTORIES.model_copy(update=changes)
     with pytest.raises(StoreError, match=message):
         begin(store, wanted.model_copy(update={"layers": (layer, *wanted.layers[1:])}), {})
     assert store.list() == before
@@ -167,7 +145,7 @@ def test_the_record_of_another_job_is_refused(store):
 def test_a_folder_of_something_else_is_no_place_for_a_release(store):
     (store.folder).mkdir()
     (store.folder / "thesis.tex").write_text("x")
-    with pytest.raises(StoreError, match="thesis.tex"):
+    with pytest.raises(StoreError, match=r"other files \(thesis.tex\); choose an empty place"):
         begin(store, made_up.recipe(2), {})
 
 
@@ -181,15 +159,6 @@ def test_repair_puts_back_recorded_bytes_alone(store):
         put_back(store, file, b"other")
     put_back(store, file, data)
     assert wrong_bytes(store, file) is None and oracle.check(store.folder)
-
-
-def test_a_release_is_not_resumed_with_other_versions(store, monkeypatch):
-    begin(store, made_up.recipe(2), {})
-    write_provenance(store, "test")
-    check_versions(store)
-    monkeypatch.setattr("dmcvb_gen.dataset.writer.environment", lambda: {"mujoco": "2.0"})
-    with pytest.raises(StoreError, match="this is mujoco 2.0"):
-        check_versions(store)
 
 
 @given(st.integers(1, 10**6), st.integers(1, 1000))

@@ -1,4 +1,4 @@
-"""Commands run in children forked from a process that has imported everything; killed, limited and metadata_files."""
+"""Commands run in children forked from a process that has imported everything; killed and limited."""
 
 from __future__ import annotations
 
@@ -28,14 +28,12 @@ class Ended:
 
     Attributes:
       stray: processes that it left behind.
-      hit: whether it was still at work when its signal came.
     """
 
     code: int
     said: str
     seconds: float
     stray: tuple[int, ...] = ()
-    hit: bool = False
 
 
 class Command:
@@ -63,18 +61,13 @@ class Command:
             self._status = status
         return not found
 
-    def workers(self) -> list[int]:
-        """Processes of its session but itself."""
-        return [pid for pid in session(self.pid) if pid != self.pid]
-
     def finish(self, after: float | None = None, act: Callable[[Command], bool] = lambda command: False) -> Ended:
         """Wait for its end; `after` so many seconds, `act` on it (True: that struck)."""
-        hit, hung = False, False
+        hung = False
         while self.alive():
             elapsed = time.time() - self._started
-            if after is not None and elapsed >= after:
-                hit = act(self)
-                after = None if hit or elapsed > after + 2 else after
+            if after is not None and elapsed >= after and (act(self) or elapsed > after + 2):
+                after = None
             if elapsed > PATIENCE and not hung:
                 hung = True
                 os.killpg(self.pid, signal.SIGKILL)
@@ -92,7 +85,7 @@ class Command:
         with os.fdopen(self._said, "rb") as pipe:
             os.set_blocking(pipe.fileno(), False)
             said = (pipe.read() or b"").decode(errors="replace") + ("\nHUNG" if hung else "")
-        return Ended(code, said, seconds, tuple(stray), hit)
+        return Ended(code, said, seconds, tuple(stray))
 
 
 def session(leader: int) -> list[int]:

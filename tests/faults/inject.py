@@ -7,11 +7,14 @@ Ends within a write come from the limit of the size of a file: the kernel stops 
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import itertools
 import os
 import resource
 import signal
 import sys
+from collections.abc import Iterator
 
 MODES = ("kill", "full", "interrupt", "cut", "quota")
 """kill: SIGKILL before the operation. full: it and all later ones that need room find none. interrupt: SIGINT.
@@ -20,44 +23,52 @@ _CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os
 _NEED_ROOM = {"open", "os.mkdir", "os.rename", "os.link"}
 
 
-class Counter:
-    """Counts a process's changes below `root`, and strikes at the `at`-th (from 0); never with at=None."""
-
-    def __init__(self, root: str, mode: str = "kill", at: int | None = None):
-        self.root, self.mode, self.at, self.count = os.path.abspath(root), mode, at, 0
-
-    def __call__(self, event: str, arguments: tuple) -> None:
-        if event == "open":
-            path, mode, flags = arguments
-            if not (flags or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
-                return
-        elif event in _CHANGES:
-            path = arguments[0]
-        else:
-            return
-        if not isinstance(path, (str, os.PathLike)) or not os.path.abspath(path).startswith(self.root):
-            return
-        number, self.count = self.count, self.count + 1
-        if self.at is None or number < self.at:
-            return
-        if self.mode == "full":
-            if event in _NEED_ROOM:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-        elif number == self.at:
-            os.kill(os.getpid(), signal.SIGKILL if self.mode == "kill" else signal.SIGINT)
+@contextlib.contextmanager
+def files_up_to(size: int) -> Iterator[None]:
+    """No file that this process writes meanwhile can grow beyond so many bytes, as on a full disk."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
-def arm(root: str, mode: str | None = None, at: int | None = None) -> Counter:
+def arm(root: str, mode: str, at: int) -> None:
     """Set a fault for the rest of this process, which is meant to be a child made for one operation.
 
     Args:
-      mode: one of MODES, None for no fault (operations are counted all the same).
+      root: folder below which changes count.
+      mode: one of MODES.
+      at: number of the change to strike at, from 0; of "cut" and "quota" the byte of a file.
     """
-    counter = Counter(root, mode or "kill", at if mode in ("kill", "full", "interrupt") else None)
     if mode in ("cut", "quota"):
         # By default Python ignores the signal, and the write fails with EFBIG as on a disk with a quota.
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL if mode == "cut" else signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_FSIZE, (at, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-    sys.addaudithook(counter)
-    return counter
+        return
+    folder, numbers = os.path.abspath(root), itertools.count()
+
+    def strike(event: str, arguments: tuple) -> None:
+        if not _is_change(event, arguments, folder):
+            return
+        number = next(numbers)
+        if mode == "full" and number >= at and event in _NEED_ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(arguments[0]))
+        if mode != "full" and number == at:
+            os.kill(os.getpid(), signal.SIGKILL if mode == "kill" else signal.SIGINT)
+
+    sys.addaudithook(strike)
+
+
+def _is_change(event: str, arguments: tuple, folder: str) -> bool:
+    if event == "open":
+        changes = (arguments[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+    else:
+        changes = event in _CHANGES
+    if not changes or not isinstance(arguments[0], (str, os.PathLike)):
+        return False
+    return os.path.abspath(arguments[0]).startswith(folder)

@@ -1,14 +1,12 @@
-"""Action repeats 1 and 4: whole releases beside dm_control stepped by hand, and beside a release at 2."""
+"""Action repeats 1 and 4: whole releases and environments beside those at 2."""
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pytest
-from dm_control import suite
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.generate.recipe import Recipe, load_recipe
+from dmcvb_gen.generate.recipe import Recipe, expand, load_recipe, override
 from dmcvb_gen.loaders import DistractedEnv
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import bundled_policies
@@ -34,21 +32,6 @@ def walkers(tmp_path_factory):
     """Action repeat -> release of the same episodes of walker's expert, 12 control steps long."""
     folder = tmp_path_factory.mktemp("repeats")
     return {repeat: rollout(folder / str(repeat), repeat, "walker-walk", "--distractor", "dynamic") for repeat in STEPS}
-
-
-@pytest.mark.parametrize("repeat", STEPS)
-def test_rewards_and_states_are_dm_controls_stepped_by_hand(walkers, repeat):
-    subset = walkers[repeat][NAME]
-    environment = suite.load("walker", "walk")
-    environment.reset()
-    physics, spec = environment.physics, mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART
-    for values in map(subset.episode, subset.episodes):
-        mujoco.mj_setState(physics.model.ptr, physics.data.ptr, values["physics"][0], spec)
-        physics.forward()
-        for step in range(STEPS[repeat]):
-            taken = [environment.step(values["action"][step]) for _ in range(repeat)]
-            np.testing.assert_allclose(values["reward"][step], sum(one.reward for one in taken), rtol=1e-5)
-            np.testing.assert_array_equal(values["physics"][step + 1], physics.get_state(spec))
 
 
 def test_a_policy_that_was_trained_at_2_acts_at_2(walkers):
@@ -108,8 +91,6 @@ def test_environments_step_at_the_repeat_of_the_data(task, setting):
 
 
 def test_time_limits_last_as_long_at_every_repeat():
-    from dmcvb_gen.generate.recipe import expand, override
-
     limits = {"walker-walk": 1000, "humanoid-walk": 1000, "ant-maze-empty7x7": 1200}
     for repeat in STEPS:
         requests = expand(override(load_recipe("dmcvb-v1"), action_repeat=repeat))

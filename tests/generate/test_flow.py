@@ -15,11 +15,6 @@ from tests.rendering.test_rendering import frames_of, renderer_of
 SIZE = 64
 
 
-def render_flow(renderer, physics, labels, next_physics, next_labels, view):
-    [seen] = look(renderer, physics, labels, [view], False, next_physics, next_labels)
-    return get_modality("flow").compute(seen)
-
-
 def pose(model, physics):
     data = mujoco.MjData(model)
     size = mujoco.mj_stateSize(model, PHYSICS_SPEC)
@@ -61,7 +56,8 @@ def test_flow_is_that_of_points_on_mujocos_geoms(task_id, setting):
     renderer, rng = renderer_of("native", task, distractor, SIZE), np.random.default_rng(0)
     view = task.views[-1]
     column = task.views.index(view)
-    found = render_flow(renderer, physics[:1], labels[:1], physics[1:2], labels[1:2], view)[0]
+    [seen] = look(renderer, physics[:1], labels[:1], [view], False, physics[1:2], labels[1:2])
+    found = get_modality("flow").compute(seen)[0]
     segmentation = renderer.render_labels(physics[:1], labels[:1], [view])["segmentation"][0, 0]
     assert found.shape == (SIZE, SIZE, 2) and found.dtype == np.float32
     eyes = [

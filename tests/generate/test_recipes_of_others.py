@@ -25,10 +25,6 @@ PUBLISHED = {
 """Recipe -> size, tasks, agent steps a subset and scales, as their papers and repositories say."""
 
 
-def run(*arguments):
-    return invoke("rollout", *arguments)
-
-
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_a_recipe_has_the_tasks_counts_sizes_and_scales_that_were_published(name):
     size, tasks, steps, scales = PUBLISHED[name]
@@ -57,15 +53,13 @@ def test_two_episodes_of_every_subset_of_a_shipped_recipe_are_planned_made_and_s
     wanted = {request.name: request for request in expand(load_recipe(name))}
     lacking = {r.task for r in wanted.values() if r.level != "random" and r.level not in bundled_levels(r.task)}
     for task in lacking:
-        refused = run("--recipe", name, task, *TINY, "--out", tmp_path / "r", "--dry-run")
-        assert refused.exit_code == 2 and refused.output.count("\n") == 1, refused.output
-        assert f"`dmcvb-gen train-behaviour {task}`" in refused.output
+        refused = invoke("rollout", "--recipe", name, task, *TINY, "--out", tmp_path / "r", "--dry-run", code=2).output
+        assert refused.count("\n") == 1 and f"`dmcvb-gen train-behaviour {task}`" in refused, refused
     tasks = sorted({request.task for request in wanted.values()} - lacking)
-    cut = ["--recipe", name, *tasks, *TINY, "--out", tmp_path / "r", "--json"]
-    planned = run(*cut, "--dry-run")
-    assert planned.exit_code == 0 and not (tmp_path / "r").exists(), planned.output
-    made = run(*cut, "--workers", 1)
-    assert made.exit_code == 0, made.output
+    cut = ["rollout", "--recipe", name, *tasks, *TINY, "--out", tmp_path / "r", "--json"]
+    invoke(*cut, "--dry-run", code=0)
+    assert not (tmp_path / "r").exists()
+    invoke(*cut, "--workers", 1, code=0)
     release = Release.open(tmp_path / "r")
     assert set(release.subsets) == {name for name, request in wanted.items() if request.task in tasks}
     assert all(len(subset.episodes) >= 2 for subset in release.subsets.values()) and not release.shortfalls

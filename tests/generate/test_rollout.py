@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import shutil
 import signal
 import subprocess
@@ -16,7 +15,7 @@ import pytest
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.distractors.backgrounds import builtin_folder, load_backgrounds
-from dmcvb_gen.errors import DmcvbError, RecipeError, RenderingError, StoreError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, RecipeError, StoreError, UnknownNameError
 from dmcvb_gen.generate.counts import count
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, start
@@ -31,12 +30,13 @@ from dmcvb_gen.spec import LEVELS, is_maze
 from dmcvb_gen.tasks import get_task
 from tests.conftest import invoke, maze_recipe, records, roll_out, short_recipe, small_recipe
 from tests.faults.commands import GRACE, session
+from tests.faults.inject import files_up_to
 
 NAME = "walker-walk/random/dynamic"
 TWICE = """name: dup
 base: &base {episodes: 1}
 subsets:
-- {tasks: walker-walk, levels: random, settings: none, <<: *base, episodes: 2}
+- {tasks: walker-walk, levels: random, settings: none, <<: *base, <<: *base, episodes: 2}
 - *base
 
 subsets:
@@ -65,8 +65,8 @@ def test_a_range_of_episodes_made_alone_gives_the_same_records(small_release, tm
 def test_settings_show_the_same_episodes_and_are_stored_once(small_release):
     release = Release.open(small_release)
     assert {subset.trajectories.name for subset in release.subsets.values()} == {"walker-walk/random/trajectories"}
-    first, *others = (subset.read("physics") for subset in release.subsets.values())
-    assert all(np.array_equal(first, other) for other in others)
+    none, static, dynamic = (subset.read("pixels") for subset in release.subsets.values())
+    assert (none != static).mean() > 0.5 and (static != dynamic).mean() > 0.3
     alone = small_recipe(trajectories="independent")
     assert len({layer.key for layer in make_plan(alone, "nowhere").release.layers.values()}) == 9
 
@@ -130,51 +130,23 @@ def test_ctrl_c_ends_cleanly_leaves_no_process_and_says_how_to_go_on(tmp_path):
     assert len(Release.open(tmp_path / "r").subsets) >= 1
 
 
-def test_what_is_there_is_not_made_again(small_release):
-    plan = make_plan(small_recipe(), small_release)
-    assert plan.works == () and plan.there
-
-
-def test_another_recipe_is_refused_and_touches_nothing(small_release):
-    before = {path: path.stat().st_mtime_ns for path in small_release.rglob("*") if path.is_file()}
-    with pytest.raises(StoreError, match="seed 3, asked for 4"):
-        make_plan(small_recipe(seed=4), small_release)
-    assert before == {path: path.stat().st_mtime_ns for path in small_release.rglob("*") if path.is_file()}
-
-
-def test_a_folder_with_other_things_is_refused(tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(StoreError, match=r"other files \(thesis.tex\); choose an empty place"):
-        start(make_plan(small_recipe(), tmp_path))
-
-
-def test_other_versions_than_those_of_the_beginning_are_refused_unless_asked_for(small_release, tmp_path):
-    shutil.copytree(small_release, tmp_path / "r")
-    (tmp_path / "r" / record_path(f"{NAME}/pixels", 1)).unlink()
-    [note] = (tmp_path / "r/provenance").glob("*.json")
+def test_other_versions_than_those_of_the_beginning_are_refused_unless_asked_for(copy):
+    (copy / record_path(f"{NAME}/pixels", 1)).unlink()
+    [note] = (copy / "provenance").glob("*.json")
     note.write_text(note.read_text().replace('"mujoco":"', '"mujoco":"1.'))
-    plan = make_plan(None, tmp_path / "r")
+    plan = make_plan(None, copy)
     with pytest.raises(StoreError, match="begun with mujoco 1.*--other-versions"):
         start(plan)
     start(plan, other_versions=True)
 
 
-def test_a_full_disk_is_said_and_costs_nothing_that_is_there(small_release, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(small_release, copy)
+def test_a_full_disk_is_said_and_costs_nothing_that_is_there(small_release, copy):
     (copy / record_path(f"{NAME}/pixels", 1)).unlink()
     pixels = copy / "walker-walk/random.zarr/dynamic/pixels/c/1/0/0/0/0"
     pixels.unlink()
     plan = make_plan(small_recipe(), copy)
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limit[1]))  # every longer file fails to be written
-        with pytest.raises(StoreError, match="no room to write to .*pixels.*make room"):
-            list(run_works(plan.works))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-        signal.signal(signal.SIGXFSZ, handler)
+    with files_up_to(20_000), pytest.raises(StoreError, match="no room to write to .*pixels.*make room"):
+        list(run_works(plan.works))
     assert not pixels.exists() and not make_plan(small_recipe(), copy).works[0].simulates
     assert roll_out(small_recipe(), copy).digest == Release.open(small_release).digest
 
@@ -205,22 +177,16 @@ def test_shipped_recipes_expand_to_what_the_paper_has():
 
 
 NONSENSE = [
-    ({"size": 0}, RenderingError, "8 to 1024"),
-    ({"size": 5000}, RenderingError, "8 to 1024"),
     ({"seed": -1}, RecipeError, "seed"),
     ({"name": "a/b"}, RecipeError, "name"),
     ({"colour": "red"}, RecipeError, "colour"),
     ({"action_repeat": 3}, RecipeError, "action_repeat: Input should be 1, 2 or 4"),
-    ({"renderer": {"backend": "povray"}}, UnknownNameError, "native"),
     ({"backgrounds": "/nowhere"}, DmcvbError, "give a folder of videos"),
     ({"subsets": []}, RecipeError, "subsets"),
     ({"subsets": [{"task": "walker-walk"}]}, RecipeError, "unknown field 'task'.*'tasks'"),
     ({"renderer": {"backend": "native", "sample": 2}}, RecipeError, "unknown field 'sample'. Did you mean 'samples'"),
 ]
 NONSENSE_OF_SUBSETS = [
-    ({"tasks": "walker-fly"}, "walker-walk"),
-    ({"levels": "master"}, "expert"),
-    ({"settings": "blurry"}, "dynamic"),
     ({"episodes": 0}, "greater than 0"),
     ({"episodes": 10**9}, "1,000,000,000 episodes are more than the 100,000,000"),
     ({"episodes": 10**7}, "shards.*give more episodes_per_shard"),
@@ -281,9 +247,8 @@ def test_a_recipe_takes_other_values_and_none_is_dropped():
     other = override(mini, episodes=5, seed=7, size=32, max_steps=50, deterministic=True)
     assert other.seed == 7 and other.size == 32
     for request in expand(other):
-        assert (
-            request.episodes == 5 and request.max_steps == 50 and request.deterministic == (request.level != "random")
-        )
+        assert request.episodes == 5 and request.max_steps == 50
+        assert request.deterministic == (request.level != "random")
     whole = narrow(load_recipe("dmcvb-v1"), (), (), ["none"])
     assert {request.episodes for request in expand(override(whole, episodes=3))} == {3}
     both = override(load_recipe("dmcvb-mini"), episodes=3)
@@ -306,11 +271,10 @@ def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_thi
         assert str(tmp_path) not in path.read_text()
     assert Regeneration(tmp_path / "r").check().sound
     [subset] = release.manifest.subsets
-    copies = load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], "train")
-    assert copies.digest == load_backgrounds("builtin", "train").digest == subset.backgrounds["digest"]
-    assert load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], "val").digest == (
-        load_backgrounds("builtin", "val").digest
-    )
+    assert subset.backgrounds["digest"] == load_backgrounds("builtin", "train").digest
+    for split in ("train", "val"):
+        copies = load_backgrounds(tmp_path / "r" / subset.backgrounds["source"], split)
+        assert copies.digest == load_backgrounds("builtin", split).digest
 
 
 def test_the_recipe_and_the_layers_name_everything_needed_to_make_it_again(small_release):
@@ -352,12 +316,6 @@ def test_what_some_subsets_take_up_is_heard():
     both = asked(maze, goals=["visible", "fixed2"], episodes=4)
     assert [request.episodes for request in both.values()] == [4, 2 * 2]
     assert set(asked(f"{maze}@geodesic", split="val")) == {f"{maze}-geodesic/expert/visible"}
-
-
-def test_merge_keys_of_a_recipe_may_repeat(tmp_path):
-    merged = "- &first {tasks: walker-walk, levels: random, settings: none, episodes: 1}\n- {<<: *first, episodes: 2}\n"
-    (tmp_path / "merged.yaml").write_text(f"name: mine\nsubsets:\n{merged}")
-    assert [pattern.episodes for pattern in load_recipe(tmp_path / "merged.yaml").subsets] == [1, 2]
 
 
 def test_shards_that_do_not_fit_in_memory_are_refused_before_any_work(tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -40,38 +41,27 @@ pytestmark = [
 ]
 
 
-def start(model: str | None, environment: dict[str, str]) -> subprocess.Popen:
+def digests(model: str | None, environment: dict[str, str]) -> dict:
+    """Task -> name -> digest, as a process prints them, under an emulated processor if a model is named."""
     command = [sys.executable, "-m", "tests.same_bits", str(STEPS), PAINTER, *TASKS]
     command = command if model is None else [shutil.which("qemu-x86_64"), "-cpu", model, *command]
-    return subprocess.Popen(
-        command,
-        cwd=Path(__file__).parents[2],
-        env=OURS | {"OMP_NUM_THREADS": "1"} | environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    variables = OURS | {"OMP_NUM_THREADS": "1"} | environment
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], env=variables, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout, f"{command}, {environment}: {done.stderr[-2000:]}"
+    return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="module")
 def found():
-    """(where, model that it is compiled for or None) -> task -> name -> digest."""
-    here = {("here", None): start(None, {})}
-    here |= {("here", model): start(None, COMPILED[model] | ALIKE[model]) for model in COMPILED}
-    printed = finish(here)
-    return printed | finish({("there", model): start(model, COMPILED[model]) for model in COMPILED})
-
-
-def finish(running):
-    """The digests of processes that run side by side."""
-    try:
-        printed = {key: process.communicate() for key, process in running.items()}
-    finally:
-        for process in running.values():
-            process.kill()
-    for key, (out, err) in printed.items():
-        assert running[key].returncode == 0 and out, f"{key}: {err[-2000:]}"
-    return {key: json.loads(out) for key, (out, _) in printed.items()}
+    """(where, model that it is compiled for or None) -> what `digests` gives; processes of a place run side by side."""
+    here = {("here", None): (None, {})}
+    here |= {("here", model): (None, COMPILED[model] | ALIKE[model]) for model in COMPILED}
+    there = {("there", model): (model, COMPILED[model]) for model in COMPILED}
+    printed = {}
+    for place in (here, there):
+        with ThreadPoolExecutor(len(place)) as pool:
+            printed |= zip(place, pool.map(digests, *zip(*place.values(), strict=True)), strict=True)
+    return printed
 
 
 @pytest.mark.parametrize("task_id", TASKS)

@@ -16,10 +16,6 @@ from dmcvb_gen.generate.shipped import ENDING, Shipped, load_shipped, pack, ship
 from tests.conftest import invoke
 
 
-def run(*arguments):
-    return invoke("regenerate", *arguments)
-
-
 @pytest.mark.full
 @pytest.mark.parametrize("name", shipped_manifests())
 def test_a_random_shard_of_each_has_the_released_bytes(name, tmp_path):
@@ -29,8 +25,7 @@ def test_a_random_shard_of_each_has_the_released_bytes(name, tmp_path):
     for record in {record.family: record for record in records}.values():
         first = chosen.randrange(record.episodes)
         words = ["--only", record.name, "--range", f"{first}:{first + 1}", "--out", tmp_path / record.family]
-        done = run("--manifest", name, *words)
-        assert done.exit_code == 0 and "same digest" in done.output, done.output
+        assert "same digest" in invoke("regenerate", "--manifest", name, *words, code=0).output
 
 
 @pytest.mark.slow_cases("dmcvb-mini", "dmcvb-v1")
@@ -46,15 +41,14 @@ def test_the_archive_of_a_release_makes_its_shards_and_finds_others(request, rel
     pack(opened, tmp_path / f"it{ENDING}")
     known, name = load_shipped(tmp_path / f"it{ENDING}"), next(iter(opened))
     assert known.digest == opened.digest and known.recipes == opened.recipes
-    asked = ["--manifest", tmp_path / f"it{ENDING}", "--only", name, "--range", "0:1", "--json"]
-    part = json.loads(run(*asked, "--out", tmp_path / "part").stdout)
+    asked = ["--only", name, "--range", "0:1", "--json"]
+    one, other = (["regenerate", "--manifest", tmp_path / f"{archive}{ENDING}"] for archive in ("it", "other"))
+    part = json.loads(invoke(*one, *asked, "--out", tmp_path / "part", code=0).stdout)
     assert part["sound"] and len(part["shards"]) == len(opened[name].layers)
     content = json.loads(lzma.decompress((tmp_path / f"it{ENDING}").read_bytes()))
     content["records"][opened[name].trajectories.name][0] = "0" * 64
     (tmp_path / f"other{ENDING}").write_bytes(lzma.compress(json.dumps(content).encode()))
-    asked[1] = tmp_path / f"other{ENDING}"
-    wrong = run(*asked, "--out", tmp_path / "other")
-    assert wrong.exit_code == 1
+    wrong = invoke(*other, *asked, "--out", tmp_path / "other", code=1)
     assert [shard["equal"] for shard in json.loads(wrong.stdout)["shards"]].count(False) == 1
 
 
@@ -71,9 +65,8 @@ WRONG = {
 @pytest.mark.parametrize("content", WRONG)
 def test_a_wrong_or_damaged_archive_is_refused_in_one_line(tmp_path, content):
     (tmp_path / f"it{ENDING}").write_bytes(WRONG[content])
-    done = run("--manifest", tmp_path / f"it{ENDING}", "--out", tmp_path / "out")
-    assert done.exit_code == 2 and "no archive of a manifest" in done.output, done.output
-    assert len(done.output.splitlines()) == 1 and not (tmp_path / "out").exists()
+    said = invoke("regenerate", "--manifest", tmp_path / f"it{ENDING}", "--out", tmp_path / "out", code=2).output
+    assert "no archive of a manifest" in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
 def test_info_names_the_shipped_release_of_the_same_digest(small_release, monkeypatch):

@@ -11,26 +11,19 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.tasks import get_task
+from tests.conftest import run
 from tests.tasks.test_tasks import SUITE
-from tests.test_whole_way import run
 
 SIZE = 16
-TINY = {
-    "warmup_steps": 8,
-    "simulations": 4,
-    "batch_size": 8,
-    "actor_hidden": [8],
-    "critic_hidden": [8],
-    "compile": "false",
-}
+TINY = ("warmup_steps=8", "simulations=4", "batch_size=8", "actor_hidden=[8]", "critic_hidden=[8]")
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("task_id", SUITE)
 def test_a_suite_task_goes_the_whole_way(task_id, tmp_path):
     folder, task = tmp_path / "release", get_task(task_id)
-    settings = [word for key, value in TINY.items() for word in ("--set", f"{key}={value}")]
-    run("train-behaviour", task_id, "--steps", 16, *settings, "--set", "bfloat16=false", "--out", tmp_path / "run")
+    settings = [f"--set={pair}" for pair in (*TINY, "compile=false", "bfloat16=false")]
+    run("train-behaviour", task_id, "--steps", 16, *settings, "--out", tmp_path / "run")
     newest = max((tmp_path / "run" / "checkpoints").glob("[0-9]*.safetensors"))
     short = ["--level", "expert", "--behaviour", newest, "--episodes", 2, "--max-steps", 4, "--size", SIZE]
     run("rollout", task_id, *short, "--distractor", "dynamic", "--out", folder)

@@ -38,11 +38,9 @@ def test_a_suite_task_is_made_by_its_name(task):
     env.close()
 
 
-def test_importing_the_package_is_enough_and_loads_no_simulator():
-    code = "import dmcvb_gen, gymnasium as g, sys; print('dmcvb_gen/walker-walk-none-v0' in g.registry)"
-    code += "; print('mujoco' in sys.modules, 'torch' in sys.modules)"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert found == ["True", "False", "False"]
+def test_importing_the_package_is_enough():
+    code = "import dmcvb_gen, gymnasium; gymnasium.spec('dmcvb_gen/walker-walk-none-v0')"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.slow_cases("dmcvb_gen/walker-walk-dynamic-v0")
@@ -55,26 +53,17 @@ def test_gymnasiums_checker_passes(name):
 
 
 def test_states_and_rewards_are_the_tasks_own():
-    env, task = gymnasium.make("dmcvb_gen/cheetah-run-static-v0", **SMALL), get_task("cheetah-run")
+    env, task = gymnasium.make("dmcvb_gen/cheetah-run-static-v0", max_steps=50, **SMALL), get_task("cheetah-run")
     observation, _ = env.reset(seed=4)
     batch = task.batch(1)
     batch.set_physics(env.unwrapped._stage.batch.physics())
-    rng, total = np.random.default_rng(0), 0.0
-    for step in range(500):
+    rng = np.random.default_rng(0)
+    for step in range(50):
         action = rng.uniform(-1, 1, 6).astype(np.float32)
-        painted = step < 8 or step == 499
-        observation, reward, terminated, truncated, _ = env.step(action) if painted else quick(env, action)
+        observation, reward, terminated, truncated, _ = env.step(action)
         result = batch.step(action[None])
-        total += reward
-        assert reward == result.reward[0] and not terminated and truncated == (step == 499)
-        if observation is not None:
-            np.testing.assert_array_equal(observation["state"], result.state[0].astype(np.float32))
-
-
-def quick(env, action):
-    """A step without its picture, to save the time of the test."""
-    reward, terminated, truncated = env.unwrapped._stage.step(action[None], np.ones(1, bool))
-    return None, float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+        assert reward == result.reward[0] and not terminated and truncated == (step == 49)
+        np.testing.assert_array_equal(observation["state"], result.state[0].astype(np.float32))
 
 
 def test_a_vector_environment_has_the_episodes_of_single_ones():
@@ -232,24 +221,22 @@ def test_mistakes_are_answered_in_a_line(names, options, words):
 def test_wrong_steps_and_seeds_are_refused_in_a_line(task):
     env, vector = DistractedEnv(task, max_steps=1, **SMALL), DistractedVectorEnv(2, task, **SMALL)
     size = env.action_space.shape[0]
-    wrong = [(lambda: env.step(np.zeros(size)), "call reset"), (lambda: DistractedVectorEnv(0, task), "at least 1")]
-    wrong += [(lambda: vector.reset(seed=[1, 2, 3]), "3 seeds are given for 2 environments")]
-    wrong += [(lambda: vector.reset(options={"reset_mask": np.ones(2, bool)}), "leave reset_mask out")]
-    for call, words in wrong:
+
+    def refused(words, call, *given, **more):
         with pytest.raises(DmcvbError, match=words):
-            call()
+            call(*given, **more)
+
+    refused("call reset", env.step, np.zeros(size))
+    refused("at least 1", DistractedVectorEnv, 0, task)
+    refused("3 seeds are given for 2 environments", vector.reset, seed=[1, 2, 3])
+    refused("leave reset_mask out", vector.reset, options={"reset_mask": np.ones(2, bool)})
     env.reset(seed=0)
     vector.reset(seed=[1, 2])
-    for call, words in (
-        (lambda: env.step(np.zeros(size + 1)), rf"shape \(1, {size + 1}\); .* takes shape \(1, {size}\)"),
-        (lambda: vector.step(np.zeros((3, size))), rf"takes shape \(2, {size}\)"),
-        (lambda: env.step(np.full(size, np.nan)), "NaN or infinite"),
-        (lambda: vector.step(np.full((2, size), np.inf)), "NaN or infinite"),
-    ):
-        with pytest.raises(DmcvbError, match=words):
-            call()
+    refused(rf"shape \(1, {size + 1}\); .* takes shape \(1, {size}\)", env.step, np.zeros(size + 1))
+    refused(rf"takes shape \(2, {size}\)", vector.step, np.zeros((3, size)))
+    refused("NaN or infinite", env.step, np.full(size, np.nan))
+    refused("NaN or infinite", vector.step, np.full((2, size), np.inf))
     assert env.step(np.zeros(size))[3]
-    with pytest.raises(DmcvbError, match="after the end of the episode"):
-        env.step(np.zeros(size))
+    refused("after the end of the episode", env.step, np.zeros(size))
     env.reset()
     assert env.step(np.zeros(size))[3]

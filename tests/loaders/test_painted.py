@@ -12,23 +12,6 @@ import dmcvb_gen
 from dmcvb_gen.dataset.pictures import picture_arrays
 from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.errors import DmcvbError, StoreError
-from tests.conftest import TINY_MAZE, roll_out, small_recipe
-
-TINY = {"levels": "random", "episodes": 3, "episodes_per_shard": 2, "max_steps": 6}
-RELEASES = {
-    "walker": {"tasks": "walker-walk", "settings": ["none", "dynamic"], **TINY},
-    "maze": {"tasks": TINY_MAZE, "settings": ["visible", "hidden"], **TINY},
-}
-
-
-@pytest.fixture(scope="module", params=RELEASES)
-def made(request, tmp_path_factory):
-    """A folder with a "painted" release, and the same made without images, "light"."""
-    folder = tmp_path_factory.mktemp(request.param)
-    recipe = small_recipe(size=32, subsets=[RELEASES[request.param]])
-    for name in ("painted", "light"):
-        roll_out(recipe, folder / name, pixels=name == "painted")
-    return folder
 
 
 def distracted(release):
@@ -38,9 +21,9 @@ def distracted(release):
 
 @pytest.mark.slow_cases("maze-light", "maze-painted")
 @pytest.mark.parametrize("which", ["light", "painted"])
-def test_pictures_painted_on_reading_are_the_stored_ones(made, which):
-    stored = dmcvb_gen.open(str(made / "painted"))
-    fresh = dmcvb_gen.open(str(made / which), paint=True, cache_bytes=1)
+def test_pictures_painted_on_reading_are_the_stored_ones(painted_and_light, which):
+    stored = dmcvb_gen.open(str(painted_and_light / "painted"))
+    fresh = dmcvb_gen.open(str(painted_and_light / which), paint=True, cache_bytes=1)
     for name, subset in stored.subsets.items():
         for array in subset.pixel_arrays:
             assert np.array_equal(fresh[name].read(array), subset.read(array)), (name, array)
@@ -50,11 +33,11 @@ def test_pictures_painted_on_reading_are_the_stored_ones(made, which):
         assert all(np.array_equal(one[key], other[key]) for key in one)
 
 
-def test_labels_of_fresh_distractors_are_those_of_their_pictures(made):
+def test_labels_of_fresh_distractors_are_those_of_their_pictures(painted_and_light):
     """The labels of an epoch are the ones that its pictures are painted from."""
-    for name in dmcvb_gen.open(str(made / "light")):
-        subset = dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample")[name]
-        stored, episode = dmcvb_gen.open(str(made / "light"))[name], int(subset.episodes[-1])
+    for name in dmcvb_gen.open(str(painted_and_light / "light")):
+        subset = dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="resample")[name]
+        stored, episode = dmcvb_gen.open(str(painted_and_light / "light"))[name], int(subset.episodes[-1])
         labels = [array for array in subset.arrays if array.startswith("exogenous/")]
         shapes = {array: stored.read(array, [episode]).shape for array in labels}
         rows, seen = int(stored.read("length", [episode])[0]) + 1, []
@@ -76,9 +59,9 @@ def test_labels_of_fresh_distractors_are_those_of_their_pictures(made):
         assert stored.record.distractor.kind == "none" or (seen[0] != seen[1]).any()
 
 
-def test_stored_modalities_are_read_with_their_own_pictures_alone(made, tmp_path):
-    name = distracted(dmcvb_gen.open(made / "light")).name
-    dmcvb_gen.repaint(made / "light", only=[name], labels=["depth"], out=tmp_path / "r", progress=False)
+def test_stored_modalities_are_read_with_their_own_pictures_alone(painted_and_light, tmp_path):
+    name = distracted(dmcvb_gen.open(painted_and_light / "light")).name
+    dmcvb_gen.repaint(painted_and_light / "light", only=[name], labels=["depth"], out=tmp_path / "r", progress=False)
     [same] = dmcvb_gen.open(str(tmp_path / "r"), paint=True).subsets.values()
     depths = [array for array in same.arrays if array.startswith("depth")]
     assert depths and set(depths) < set(same.episode(0))
@@ -89,8 +72,8 @@ def test_stored_modalities_are_read_with_their_own_pictures_alone(made, tmp_path
             subset.array(depths[0])
 
 
-def test_fresh_distractors_are_the_same_alone_and_drawn_together(made, monkeypatch):
-    opened = [dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample") for _ in range(2)]
+def test_fresh_distractors_are_the_same_alone_and_drawn_together(painted_and_light, monkeypatch):
+    opened = [dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="resample") for _ in range(2)]
     together, alone = map(distracted, opened)
     array, episodes = together.picture_names[0], together.episodes[::-1]
     batch = together.rows([array], episodes)[array]
@@ -101,10 +84,10 @@ def test_fresh_distractors_are_the_same_alone_and_drawn_together(made, monkeypat
 
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("kind", ["steps", "episodes", "stream"])
-def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(made, kind, workers):
+def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(painted_and_light, kind, workers):
     import torch
 
-    subset = distracted(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample"))
+    subset = distracted(dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="resample"))
     few = [int(subset.episodes[0])]
     data = subset.torch(kind, episodes=few, **({"batch_size": 4, "shuffle": False} if kind == "stream" else {}))
     loader = torch.utils.data.DataLoader(
@@ -122,8 +105,8 @@ def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(made
 
 
 @pytest.mark.slow_cases("maze")
-def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
-    subset = distracted(dmcvb_gen.open(str(made / "light"), paint=True, distractors="resample"))
+def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(painted_and_light):
+    subset = distracted(dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="resample"))
     streams = [subset.torch("stream", batch_size=4, shuffle=False, buffer=1, epoch=epoch) for epoch in (1, 2)]
     alone = [[batch["pixels"].numpy() for batch in stream] for stream in streams]
     turns = [[pair[index]["pixels"].numpy() for pair in zip(*streams, strict=True)] for index in (0, 1)]
@@ -133,8 +116,8 @@ def test_two_streams_of_one_subset_read_in_turns_keep_their_epochs(made):
 
 
 @pytest.mark.parametrize("way", [{}, {"paint": True, "distractors": "resample"}])
-def test_of_several_threads_one_reads_a_source(made, way, monkeypatch):
-    subset = distracted(dmcvb_gen.open(str(made / "painted"), **way))
+def test_of_several_threads_one_reads_a_source(painted_and_light, way, monkeypatch):
+    subset = distracted(dmcvb_gen.open(str(painted_and_light / "painted"), **way))
     tables, real = [], StepTable.read
     monkeypatch.setattr(StepTable, "read", lambda *options: tables.append(1) or real(*options))
     source = pickle.loads(pickle.dumps(subset.source()))
@@ -144,8 +127,8 @@ def test_of_several_threads_one_reads_a_source(made, way, monkeypatch):
     assert len(tables) == 1
 
 
-def test_painted_episodes_are_kept_while_there_is_room(made):
-    subset = next(iter(dmcvb_gen.open(str(made / "light"), paint=True).subsets.values()))
+def test_painted_episodes_are_kept_while_there_is_room(painted_and_light):
+    subset = next(iter(dmcvb_gen.open(str(painted_and_light / "light"), paint=True).subsets.values()))
     name = subset.picture_names[0]
     assert subset.painted(0, [name])[name] is subset.painted(0)[name]
     subset.painting.__dict__["cache_bytes"] = 1
@@ -153,8 +136,8 @@ def test_painted_episodes_are_kept_while_there_is_room(made):
     assert subset.painted(2) and subset.painted(1, [name])[name] is not first
 
 
-def test_a_way_of_painting_that_there_is_not_is_refused(made):
+def test_a_way_of_painting_that_there_is_not_is_refused(painted_and_light):
     with pytest.raises(DmcvbError, match="resample"):
-        dmcvb_gen.open(str(made / "light"), paint=True, distractors="new")
+        dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="new")
     with pytest.raises(TypeError, match="distractor"):
-        dmcvb_gen.open(str(made / "light"), paint=True, distractor="resample")
+        dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractor="resample")

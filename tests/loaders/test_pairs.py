@@ -12,25 +12,21 @@ import dmcvb_gen
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.pictures import picture_arrays
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from tests.conftest import TINY_MAZE, roll_out, small_recipe, stack_channels
-
-FAMILIES = {"walker-walk": ["none", "static"], "ant-maze-tiny": ["visible", "hidden"]}
-FEW = {"levels": "random", "episodes": 4, "episodes_per_shard": 2, "max_steps": 12}
+from tests.conftest import roll_out, short_recipe, stack_channels
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
-def made(request, tmp_path_factory):
-    """(folder, names of two subsets): the release is "whole" in that folder, and "light" has no images."""
-    folder, settings = tmp_path_factory.mktemp(request.param), FAMILIES[request.param]
-    task = TINY_MAZE if request.param.startswith("ant") else request.param
-    for name in ("whole", "light"):
-        recipe = small_recipe(name="pairs", subsets=[FEW | {"tasks": task, "settings": settings}])
-        roll_out(recipe, folder / name, pixels=name == "whole")
-    return folder, [f"{request.param}/random/{setting}" for setting in settings]
+@pytest.fixture
+def made(painted_and_light):
+    """(folder, names of two subsets) of a release that is "painted" in that folder, and "light" without images."""
+    return painted_and_light, sorted(Release.open(painted_and_light / "light"), reverse=True)
 
 
 def paired(folder, names, *settings, **options):
-    return dmcvb_gen.open(folder, **options)[names[0]].paired(*(settings or FAMILIES[names[0].split("/")[0]]))
+    return dmcvb_gen.open(folder, **options)[names[0]].paired(*(settings or settings_of(names)))
+
+
+def settings_of(names):
+    return [name.split("/")[-1] for name in names]
 
 
 def by_step(batches):
@@ -39,14 +35,14 @@ def by_step(batches):
     return {(int(episode), int(step)): np.asarray(pixels) for rows in each for episode, step, pixels in rows}
 
 
-@pytest.mark.slow_cases("ant-maze-tiny-light", "ant-maze-tiny-whole")
-@pytest.mark.parametrize("which", ["whole", "light"])
+@pytest.mark.slow_cases("maze-light", "maze-painted")
+@pytest.mark.parametrize("which", ["painted", "light"])
 def test_a_pair_shows_each_state_under_both_settings_in_every_form(made, which):
     folder, names = made
-    stored, images = [Release.open(folder / "whole")[name] for name in names], [("pixels",)] * 2
+    stored, images = [Release.open(folder / "painted")[name] for name in names], [("pixels",)] * 2
     if names[0].startswith("ant"):  # the states of both looks are those of the first subset
         stored[1], images = stored[0], [picture_arrays(stored[0].record.views, hidden) for hidden in (False, True)]
-    episodes = [[subset.episode(e, arrays) for e in range(4)] for subset, arrays in zip(stored, images, strict=True)]
+    episodes = [[subset.episode(e, arrays) for e in range(3)] for subset, arrays in zip(stored, images, strict=True)]
     pairs = paired(folder / which, names)
     again, source = pickle.loads(pickle.dumps(pairs)), pairs.source(in_memory=False)
     forms = [pairs.batches(8), again.torch("stream", batch_size=8), [pairs.source().gather(range(len(source)))]]
@@ -65,12 +61,12 @@ def test_a_pair_shows_each_state_under_both_settings_in_every_form(made, which):
     assert next(iter(pairs.batches(4, pictures="agents", next_step=True)))["next_pixels"].shape[:2] == (4, 2)
 
 
-@pytest.mark.slow_cases("ant-maze-tiny")
+@pytest.mark.slow_cases("maze")
 def test_settings_that_are_not_stored_or_named_twice_are_fresh_and_change_with_the_epoch(made):
     folder, names = made
-    first, second = FAMILIES[names[0].split("/")[0]]
+    first, second = settings_of(names)
     fresh = [second, "dynamic_hard"] if first == "none" else [second]
-    pairs = paired(folder / "whole", names, first, second, *fresh)
+    pairs = paired(folder / "painted", names, first, second, *fresh)
     data, seen = pairs.torch("steps", in_memory=False), []
     for epoch in (0, 1, 0):
         data.set_epoch(epoch)
@@ -87,13 +83,13 @@ def test_settings_that_are_not_stored_or_named_twice_are_fresh_and_change_with_t
 def test_what_cannot_be_paired_is_refused_in_a_line(made):
     folder, names = made
     with pytest.raises(DmcvbError, match="1 settings are given; give two or more"):
-        paired(folder / "whole", names, FAMILIES[names[0].split("/")[0]][0])
+        paired(folder / "painted", names, settings_of(names)[0])
     with pytest.raises(UnknownNameError, match="stattic"):
-        paired(folder / "whole", names, "stattic", "stattic")
-    subset = dmcvb_gen.open(folder / "whole")[names[0]]
+        paired(folder / "painted", names, "stattic", "stattic")
+    subset = dmcvb_gen.open(folder / "painted")[names[0]]
     subset.record = subset.record.model_copy(update={"renderer": {"name": "imported"}})
     with pytest.raises(DmcvbError, match="was imported and cannot be rendered; name settings that the release holds"):
-        subset.paired(*[FAMILIES[names[0].split("/")[0]][0]] * 2)
+        subset.paired(*settings_of(names)[:1] * 2)
 
 
 def knowing(pairs, values):
@@ -109,9 +105,8 @@ def knowing(pairs, values):
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
     """Pairs of 8 short episodes of the walker without and with dynamic distractors."""
-    few = FEW | {"tasks": "walker-walk", "settings": ["none", "dynamic"], "episodes": 8}
     folder = tmp_path_factory.mktemp("pairs") / "r"
-    roll_out(small_recipe(name="pairs", subsets=[few]), folder)
+    roll_out(short_recipe(settings=["none", "dynamic"], episodes=8, max_steps=12), folder)
     return dmcvb_gen.open(folder)["walker-walk/random/none"].paired("none", "dynamic")
 
 

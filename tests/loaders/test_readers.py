@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader
 import dmcvb_gen
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.loaders import sampler
+from tests.web_server import serving
 
 NAME = "walker-walk/random/dynamic"
 
@@ -30,7 +31,14 @@ EVERY_STEP = {(episode, step) for episode in range(3) for step in range(500)}
 
 
 def test_xarray_is_lazy_and_holds_every_array(subset):
-    data = subset.xarray([0, 2])
+    data, pixels = subset.xarray([0, 2]), subset.read("pixels", [0, 2])
+    assert not data["pixels"].variable._in_memory and data["pixels"].encoding["shards"][0] == 2
+    for given, wanted in (
+        (dict(episode=1), pixels[1]),
+        (dict(episode=[1, 0], step=slice(None, None, 2)), pixels[[1, 0]][:, ::2]),
+        (dict(step=-1, channel=[2, 1]), pixels[:, -1][..., [2, 1]]),
+    ):
+        np.testing.assert_array_equal(data["pixels"].isel(given).values, wanted)
     assert dict(data.sizes).items() >= {"episode": 2, "step": 501, "height": 16, "state_dim": 24}.items()
     assert list(data.episode.values) == [0, 2] and data.attrs["task"] == "walker-walk"
     np.testing.assert_array_equal(data["action"].sel(episode=2), subset.read("action", [2])[0])
@@ -119,9 +127,8 @@ def test_batches_pass_over_every_step_once_in_an_order_that_the_seed_decides(sub
     assert [len(batch["step"]) for batch in one] == [64] * 23 + [28]
     assert set(keys(one)) == EVERY_STEP and len(keys(one)) == 1500
     assert keys(one) == keys(subset.batches(64, seed=1, buffer=2))
-    assert (
-        keys(one) != keys(subset.batches(64, seed=2, buffer=2)) != keys(subset.batches(64, seed=2, epoch=1, buffer=2))
-    )
+    other = keys(subset.batches(64, seed=2, buffer=2))
+    assert keys(one) != other != keys(subset.batches(64, seed=2, epoch=1, buffer=2))
     batch, episodes = one[5], {e: subset.episode(e) for e in range(3)}
     for row in range(64):
         episode, step = episodes[int(batch["episode"][row])], int(batch["step"][row])
@@ -152,14 +159,10 @@ def test_a_mask_chooses_episodes_and_other_values_are_refused(subset):
         list(subset.batches(4, episodes=[]))
 
 
-def test_states_alone_are_read_without_pixels(subset):
-    [batch] = subset.batches(10_000, pictures=())
-    assert "pixels" not in batch and batch["state"].shape == (1500, 24)
-
-
 def test_loader_workers_share_the_episodes(subset):
     data = subset.torch("stream", batch_size=100, pictures=(), seed=3)
     loaded = keys(DataLoader(data, batch_size=None, num_workers=2))
+    assert "pixels" not in next(iter(data))
     assert len(loaded) == 1500 and set(loaded) == EVERY_STEP
     again = keys(DataLoader(data, batch_size=None, num_workers=2))
     assert loaded == again
@@ -212,16 +215,19 @@ def test_a_subset_counts_its_episodes_and_gives_them_in_their_order(subset):
         subset[3]
 
 
+def test_a_shard_costs_a_web_server_a_handful_of_requests(small_release):
+    with serving(small_release) as server:
+        assert dmcvb_gen.open(server.url)[NAME].read("pixels", [0, 1]).any()
+        paths = [path for _, path, _ in server.asked]
+    assert len(paths) <= 10 and len(set(paths)) == len(paths), paths  # nothing is read twice
+
+
 def test_a_digest_from_outside_is_compared(small_release):
     digest = dmcvb_gen.open(small_release).digest
-    for opened in (dmcvb_gen.open(small_release, digest=digest), dmcvb_gen.open(f"{small_release}@sha256:{digest}")):
-        assert opened.compared
-    for other in (
-        lambda: dmcvb_gen.open(small_release, digest="0" * 64),
-        lambda: dmcvb_gen.open(f"{small_release}@sha256:{'0' * 64}", paint=True),
-    ):
+    assert dmcvb_gen.open(f"{small_release}@sha256:{digest}").compared
+    for paint in (False, True):
         with pytest.raises(StoreError, match=f"is release {digest}"):
-            other()
+            dmcvb_gen.open(small_release, digest="0" * 64, paint=paint)
 
 
 @pytest.mark.slow_cases("small_mazes-True")

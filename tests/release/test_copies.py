@@ -20,6 +20,7 @@ from dmcvb_gen.storage.store import open_store
 from tests.conftest import wrong_files
 from tests.dataset.made_up import make, recipe
 from tests.fake_hub import fake_hub
+from tests.web_server import serving_s3
 
 
 def content(place, storage_options=None):
@@ -37,14 +38,9 @@ def made(tmp_path):
 
 @pytest.fixture(scope="module")
 def server():
-    """An S3 server with a bucket."""
-    fsspec = pytest.importorskip("s3fs")
-    moto = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    moto.start()
-    options = {"endpoint_url": "http://{}:{}".format(*moto.get_host_and_port()), "key": "k", "secret": "s"}
-    fsspec.S3FileSystem(**options, skip_instance_cache=True).mkdir("copies")
-    yield options
-    moto.stop()
+    """Options of an S3 server with a bucket."""
+    with serving_s3("copies") as options:
+        yield options
 
 
 @pytest.fixture(params=["folder", "bucket", "hub"])

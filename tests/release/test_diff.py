@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import json
 
-from click.testing import CliRunner
-
-from dmcvb_gen.cli import main
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.diff import diff
 from dmcvb_gen.release.fetch import fetch
-from tests.conftest import maze_recipe, roll_out
+from tests.conftest import invoke, maze_recipe, roll_out
 
 NAME, MAZE = "walker-walk/random/none", "ant-maze-tiny/random/visible"
 
 
 def test_equal_releases_have_no_difference(small_release, maze_release):
     for folder in (small_release, maze_release):
-        result = CliRunner().invoke(main, ["diff", str(folder), f"file://{folder}"])
-        assert result.exit_code == 0 and "no difference" in result.output
+        assert "no difference" in invoke("diff", folder, f"file://{folder}", code=0).output
 
 
 def test_what_differs_is_named(maze_release, small_release, tmp_path):
@@ -35,11 +31,10 @@ def test_what_differs_is_named(maze_release, small_release, tmp_path):
 
 def test_a_part_lacks_episodes_alone(small_release, tmp_path):
     fetch(f"file:{small_release}", tmp_path / "part", [NAME], (0, 1))
-    result = CliRunner().invoke(main, ["diff", str(small_release), str(tmp_path / "part"), "--json"])
-    assert result.exit_code == 1
+    found = json.loads(invoke("diff", small_release, tmp_path / "part", "--json", code=1).output)
     here = {record.name: 2 if record.name == NAME else 0 for record in Release.open(small_release).manifest.subsets}
     said = [{"subset": name, "message": f"local episodes: 3 and {count}"} for name, count in here.items()]
-    assert json.loads(result.output) == {"differences": said}
+    assert found == {"differences": said}
 
 
 def test_an_array_that_only_one_has_is_not_called_different(small_release, tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -18,23 +17,14 @@ from tests.conftest import invoke, rewrite, roll_out, small_recipe, wrong_files
 NAME, MAZE = "walker-walk/random/dynamic", "ant-maze-tiny/random/visible"
 
 
-@pytest.fixture
-def copy(small_release, tmp_path):
-    shutil.copytree(small_release, tmp_path / "copy")
-    return tmp_path / "copy"
+COUNTS = {"small_release": {"subsets": 3, "episodes": 9, "steps": 4500}, "small_mazes": {"subsets": 3, "episodes": 6}}
 
 
-@pytest.mark.parametrize(
-    ("release", "counts"),
-    [
-        ("small_release", {"subsets": 3, "episodes": 9, "steps": 4500}),
-        ("small_mazes", {"subsets": 3, "episodes": 6}),
-    ],
-)
-def test_a_sound_release_passes(release, counts, request):
+@pytest.mark.parametrize("release", COUNTS)
+def test_a_sound_release_passes(release, request):
     folder = request.getfixturevalue(release)
     result = verify(folder)
-    assert result.sound and result.complete and {**result.checked, **counts} == result.checked
+    assert result.sound and result.complete and COUNTS[release].items() <= result.checked.items()
     assert result.digest == sha256_file(folder / "manifest.json") and not result.compared
     said = invoke("verify", f"{folder}@sha256:{'0' * 64}", code=2).output
     assert f"is release {result.digest}, not 0000" in said

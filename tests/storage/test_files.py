@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import resource
-import signal
 import subprocess
 import sys
 
 import pytest
 
 from dmcvb_gen import files
+from tests.faults.inject import files_up_to
 
 
 def test_bytes_text_and_json_are_put_in_place(tmp_path):
@@ -32,14 +31,8 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
         temporary.write_text("half")
         assert temporary.name.endswith(files.PARTIAL) and temporary.parent == tmp_path
         raise RuntimeError
-    limit, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit[1]))  # a full disk
-        with pytest.raises(OSError):
-            files.write_bytes(path, b"x" * 100)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-        signal.signal(signal.SIGXFSZ, handler)
+    with files_up_to(10), pytest.raises(OSError):
+        files.write_bytes(path, b"x" * 100)
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.txt"]
 
 

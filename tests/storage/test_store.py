@@ -27,7 +27,7 @@ from dmcvb_gen.storage.places import Place, local_path, shown
 from dmcvb_gen.storage.store import NotThere, open_store
 from dmcvb_gen.storage.zarr_files import ZarrFiles
 from tests.fake_hub import fake_hub
-from tests.web_server import serving
+from tests.web_server import serving, serving_s3
 
 DEEP = "walker-walk/expert.zarr/pixels/c/0/0/0"
 ODD = "a [b]*::c#d?e%20f~/ü.json"
@@ -298,24 +298,15 @@ class TestFolderWithoutLinks(StoreTests):
 
 
 @pytest.fixture(scope="module")
-def moto():
-    pytest.importorskip("s3fs")
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    yield "http://{}:{}".format(*server.get_host_and_port())
-    server.stop()
+def s3_options():
+    with serving_s3("contract") as options:
+        yield options
 
 
 class TestS3(StoreTests):
-    OPTIONS = {"key": "someone", "secret": "a/very-secret", "client_kwargs": {"use_ssl": False}}
-
     @pytest.fixture
-    def store(self, moto):
-        import s3fs
-
-        options = {**self.OPTIONS, "endpoint_url": moto}
-        s3fs.S3FileSystem(**options).makedirs("contract", exist_ok=True)
-        return open_store(f"s3://contract/{uuid.uuid4().hex}/r [1] *::x#y?z ~", options)
+    def store(self, s3_options):
+        return open_store(f"s3://contract/{uuid.uuid4().hex}/r [1] *::x#y?z ~", s3_options)
 
     def test_a_bucket_that_is_not_there_is_said(self, store):
         with pytest.raises(StoreError, match="create the bucket first"):
@@ -324,14 +315,14 @@ class TestS3(StoreTests):
             open_store("s3://no-such-bucket/x", store.options).read("a", 1)
 
     @pytest.mark.parametrize("status, code", [(200, ""), (501, "NotImplemented")])
-    def test_a_store_that_ignores_or_refuses_conditions_is_refused_in_a_line(self, status, code):
+    def test_a_store_that_ignores_or_refuses_conditions_is_refused_in_a_line(self, s3_options, status, code):
         def answer(request):
             request.rfile.read(int(request.headers.get("Content-Length", 0)))
             body = f"<Error><Code>{code}</Code><Message>A header you provided</Message></Error>" if code else ""
             request.give(body.encode(), status, ETag='"1"')
 
         with serving(answer) as server:
-            store = open_store("s3://bucket/x", {**self.OPTIONS, "endpoint_url": server.url})
+            store = open_store("s3://bucket/x", s3_options | {"endpoint_url": server.url})
             with pytest.raises(StoreError, match="does not support conditional writes"):
                 store.create("a", b"1")
             assert len(server.asked) <= 2
@@ -508,16 +499,16 @@ def test_places_that_lead_nowhere_are_refused(place):
     assert str(caught.value).isprintable() and "secret" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "place, words",
-    [
-        ("file:/tmp/x", "--option has no effect: /tmp/x is a folder"),
-        ("http://x/y", "Known: headers"),
-        ("hf://datasets/a/b", "Known: endpoint, token"),
-    ],
-)
-def test_options_without_an_effect_are_refused(place, words):
-    with pytest.raises(DmcvbError, match=words):
+NO_OPTION = {
+    "file:/tmp/x": "--option has no effect: /tmp/x is a folder",
+    "http://x/y": "Known: headers",
+    "hf://datasets/a/b": "Known: endpoint, token",
+}
+
+
+@pytest.mark.parametrize("place", NO_OPTION)
+def test_options_without_an_effect_are_refused(place):
+    with pytest.raises(DmcvbError, match=NO_OPTION[place]):
         open_store(place, {"key": 1})
 
 
