@@ -15,7 +15,7 @@ from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, run_plan, start
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.parallel import Ray
-from tests.conftest import invoke, roll_out
+from tests.conftest import invoke, roll_out, run, told
 from tests.dataset.oracle import contents
 
 WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}
@@ -42,23 +42,18 @@ def whole(tmp_path_factory):
     return roll_out(quick_recipe(), tmp_path_factory.mktemp("whole") / "r")
 
 
-def run(*words, code=0):
-    result = invoke(*words, code=code)
-    return result.stdout if code == 0 else result.output
-
-
 def test_parts_made_anywhere_give_the_files_of_one_rollout(whole, recipe_file, tmp_path):
     place = tmp_path / "r"
-    begun = json.loads(run("cluster", "begin", "--recipe", recipe_file, "--out", place, "--json"))
+    begun = told("cluster", "begin", "--recipe", recipe_file, "--out", place)
     assert begun["shards"] == 8
     for part in ("2/3", "1/3"):
         run("cluster", "part", place, part, "--workers", 1)
-    assert "not complete" in run("cluster", "finish", place, code=1)
-    found = json.loads(run("status", place, "--json"))
+    assert "not complete" in invoke("cluster", "finish", place, code=1).output
+    found = told("status", place)
     assert (found["done"], found["total"], found["complete"]) == (9, 12, False)
     run("cluster", "part", place, "3/3", "--workers", 1)
     assert "finish the release: dmcvb-gen cluster finish" in run("status", place)
-    done = json.loads(run("cluster", "finish", place, "--json"))
+    done = told("cluster", "finish", place)
     assert done["complete"] and done["digest"] == whole.digest
     assert contents(place) == contents(Path(whole.path)) and "complete" in run("status", place)
 
@@ -75,7 +70,7 @@ def test_parts_and_repeated_begins_obey_the_renderer_of_the_begun_release(tmp_pa
     words = ["walker-walk", "--level", "random", "--episodes", 1, "--max-steps", 3, "--out", tmp_path / "r"]
     asked = []
     monkeypatch.setattr(resolve, "default_renderer", lambda task: asked.append(task.id) or "native")
-    begun = json.loads(run("cluster", "begin", *words, "--json"))
+    begun = told("cluster", "begin", *words)
     assert asked == ["walker-walk"]
     monkeypatch.setattr(resolve, "default_renderer", lambda task: pytest.fail("a part asks for a renderer"))
     for command in (["begin", *words], ["part", tmp_path / "r", "1/1"], ["finish", tmp_path / "r"]):

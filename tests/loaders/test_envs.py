@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
@@ -17,7 +14,7 @@ from dmcvb_gen.loaders.register import MAZES, SUITE, TASKS, environments
 from dmcvb_gen.spec import DISTRACTOR_KINDS as SETTINGS
 from dmcvb_gen.tasks import ANT_MAZE_TASKS, LOCOMOTION_TASKS, get_task, suite_ids
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
-from tests.conftest import TINY_MAZE, stack_channels
+from tests.conftest import TINY_MAZE, python, stack_channels
 
 SMALL = dict(size=16)
 
@@ -39,8 +36,7 @@ def test_a_suite_task_is_made_by_its_name(task):
 
 
 def test_importing_the_package_is_enough():
-    code = "import dmcvb_gen, gymnasium; gymnasium.spec('dmcvb_gen/walker-walk-none-v0')"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    python("import dmcvb_gen, gymnasium; gymnasium.spec('dmcvb_gen/walker-walk-none-v0')")
 
 
 @pytest.mark.slow_cases("dmcvb_gen/walker-walk-dynamic-v0")

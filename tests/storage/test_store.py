@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import pickle
 import socket
-import subprocess
 import sys
 import threading
 import tracemalloc
@@ -26,6 +25,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.storage.places import Place, local_path, shown
 from dmcvb_gen.storage.store import NotThere, open_store
 from dmcvb_gen.storage.zarr_files import ZarrFiles
+from tests.conftest import python
 from tests.fake_hub import fake_hub
 from tests.web_server import serving, serving_s3
 
@@ -228,7 +228,7 @@ class TestFolder(StoreTests):
         )
         store.create("a/c", b"1")
         for how in ("create", "replace"):
-            assert subprocess.run([sys.executable, "-c", code, store.place, how]).returncode == -9
+            python(code, store.place, how, code=-9)
             assert store.size("a/b") is None and store.list() == {"a/c": 1}
         assert store.create("a/b", b"mine") and store.replace("a/b", b"2")
         assert sorted(path.name for path in (store.folder / "a").iterdir()) == ["b", "c"]
