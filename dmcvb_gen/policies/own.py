@@ -23,6 +23,10 @@ from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
 from dmcvb_gen.tasks.base import Task
 
 MARK = "not regenerable without that code"
+ROUNDING = 1e-4
+"""Actions of a row may differ by so much with the rows beside it: products of matrices round by their sizes."""
+PROBES = [0, 1], [1, 0], [1]
+"""Rows of the two observations that a function is asked for, again and again."""
 
 
 class RowGenerator:
@@ -46,11 +50,18 @@ class RowGenerator:
 
 
 class OwnPolicy(Policy):
-    """A behaviour policy that is a function of the user's; the function draws its own noise, if it wants any."""
+    """A behaviour policy that is a function of the user's; the function draws its own noise, if it wants any.
+
+    Two known observations are shown to it again before its calls number 1, 2, 4, 8 and so on, in another order and
+    alone: an action must follow from its row alone, not from calls before it, the clock or its neighbors.
+
+    Args:
+      seen: (2, observation) float32, these observations.
+    """
 
     unit = False
 
-    def __init__(self, name: str, function: Callable[..., Any], task: Task, digest: str):
+    def __init__(self, name: str, function: Callable[..., Any], task: Task, digest: str, seen: np.ndarray):
         header = PolicyHeader(
             task=task.id,
             observation=task.observation,
@@ -63,11 +74,31 @@ class OwnPolicy(Policy):
         )
         super().__init__(header, {}, digest)
         self._name, self._function, self._bounds = name, function, (task.action_low, task.action_high)
+        self._seen, self._calls = seen, 0
+        self._known = self._probe(PROBES[0])
+        self._check()
+
+    def _probe(self, rows: Sequence[int]) -> np.ndarray:
+        return self._ask(self._seen[rows], [np.random.default_rng(row) for row in rows])
+
+    def _check(self) -> None:
+        for rows in PROBES:
+            if not np.allclose(self._probe(rows), self._known[rows], atol=ROUNDING):
+                raise PolicyFileError(
+                    f"behaviour {self._name} gave other actions for the same observation; let each row follow from its "
+                    "own observation and from what its generator draws, and keep nothing from call to call"
+                )
 
     def act(self, observation, generators=None, deterministic=False):
+        self._calls += 1
+        if self._calls.bit_count() == 1:
+            self._check()
+        return self._ask(observation, generators or ())
+
+    def _ask(self, observation: np.ndarray, generators: Sequence[np.random.Generator]) -> np.ndarray:
         asked = (len(observation), self.header.action_size)
         try:
-            action = np.asarray(self._function(np.array(observation, np.float32), RowGenerator(generators or ())))
+            action = np.asarray(self._function(np.array(observation, np.float32), RowGenerator(generators)))
         except Exception as error:  # the user's code
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise PolicyFileError(f"behaviour {self._name} failed ({type(error).__name__}: {reason})") from error
@@ -84,7 +115,7 @@ class OwnPolicy(Policy):
 
 
 def own_policy(name: str, task: Task) -> OwnPolicy:
-    """The behaviour policy of a function "<module>:<function>", tried on two observations of zeros.
+    """The behaviour policy of a function "<module>:<function>", tried on observations of the task.
 
     Raises:
       DmcvbError: its code may not run, cannot be found, fails, or gives no actions of the task.
@@ -95,6 +126,8 @@ def own_policy(name: str, task: Task) -> OwnPolicy:
         raise PolicyFileError(
             f"behaviour {name} is no function of a module with a source file; give <module>:<function>"
         )
-    policy = OwnPolicy(name, function, task, digest)
-    policy.act(np.zeros((2, task.behaviour_size), np.float32), [np.random.default_rng(row) for row in range(2)])
-    return policy
+    batch, generators = task.batch(2), [np.random.default_rng(row) for row in range(2)]
+    batch.reset(generators)
+    actions = [generator.uniform(task.action_low, task.action_high) for generator in generators]
+    batch.step(np.stack(actions))  # as some tasks always start alike
+    return OwnPolicy(name, function, task, digest, batch.behaviour_observation())
