@@ -28,7 +28,7 @@ class UnknownNameError(DmcvbError, KeyError):
     """
 
     def __init__(self, kind: str, name: object, known: Iterable[str], cure: str = ""):
-        known = list(map(str, known))
+        known = list(dict.fromkeys(map(str, known)))
         longer = [other for other in known if name and other.startswith(str(name))]
         known = sorted(known)
         near = longer or difflib.get_close_matches(str(name), known, n=1)

@@ -175,8 +175,8 @@ def make(
         if len(order) < 2:
             raise DmcvbError(f"{part} has {len(order)} episodes; give 2 or more, for train and val")
         count = max(1, round(held_out * len(order)))
-        train.append(subset.part(order[count:]))
-        val.append(subset.part(order[:count]))
+        train.append(subset.part(np.sort(order[count:])))
+        val.append(subset.part(np.sort(order[:count])))
     learned, held = (one[0] if len(one) == 1 else UnionReader(opened, one) for one in (train, val))
     return Made(learned.environment(**environment or {}), learned, held)
 

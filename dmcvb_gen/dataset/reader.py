@@ -307,10 +307,10 @@ class Subset:
         """
         if episodes is None:
             return self.episodes
-        chosen = np.asarray(list(episodes))
+        chosen = np.asarray(list(episodes) if np.iterable(episodes) else episodes)
         if chosen.dtype == bool and chosen.shape == self.episodes.shape:
             return self.episodes[chosen]
-        if chosen.size and chosen.dtype.kind not in "iu":
+        if chosen.ndim != 1 or chosen.size and chosen.dtype.kind not in "iu":
             raise StoreError(
                 f"episodes are {chosen.dtype} of shape {chosen.shape}; give indices, or a mask of all "
                 f"{len(self.episodes)} episodes of {self.name}"

@@ -201,7 +201,7 @@ class PaintedSubset(SubsetReader):
     def _fresh_labels(self, episode: int) -> DistractorState:
         """Labels of an episode's frames in this epoch; they are drawn with those of its neighbors."""
         if (episode, self.epoch) not in self._drawn:
-            first = int(np.searchsorted(self.episodes, episode)) // DRAWN_TOGETHER * DRAWN_TOGETHER
+            first = int(np.argmax(self.episodes == episode)) // DRAWN_TOGETHER * DRAWN_TOGETHER
             self._draw_labels(self.episodes[first : first + DRAWN_TOGETHER].tolist())
         return self._drawn[episode, self.epoch]
 

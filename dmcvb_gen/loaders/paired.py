@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -36,8 +35,8 @@ class PairedReader(SubsetReader):
             for place, (spec, name) in enumerate(zip(specs, names, strict=True))
         )
         self.looks, self.fresh = len(self.parts), any(part.fresh for part in self.parts)
-        every = [subset.episodes, *(part.episodes for part in self.parts)]
-        self.__dict__["_episodes"] = functools.reduce(np.intersect1d, every)
+        everywhere = np.all([np.isin(subset.episodes, part.episodes) for part in self.parts], axis=0)
+        self.__dict__["_episodes"] = subset.episodes[everywhere]
         self.set_epoch(0)
 
     def evaluate_invariance(self, encoder: Callable[[np.ndarray], Any], **options: Any) -> Any:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import copy
 import importlib
-from collections.abc import Iterable, Iterator
+import inspect
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
-
-import numpy as np
 
 from dmcvb_gen import loaders
 from dmcvb_gen.dataset.gate import Release
@@ -32,11 +31,11 @@ class SubsetReader(Subset):
         return self.episode(int(self._episodes[index]))
 
     def part(self, episodes: Iterable[int]) -> Self:
-        """The same subset with some of its episodes alone: indices, or a mask such as `subset.returns > 900`."""
+        """The same subset with these episodes alone, in this order: indices, or a mask such as `subset.returns > 900`."""
         chosen = copy.copy(self)
         for name in ("lengths", "returns"):
             chosen.__dict__.pop(name, None)
-        chosen.__dict__["_episodes"] = np.unique(self.choose(episodes))
+        chosen.__dict__["_episodes"] = self.choose(episodes)
         return chosen
 
     def paired(self, *settings: str) -> Any:
@@ -77,21 +76,25 @@ class SubsetReader(Subset):
           options: options of that class.
 
         Raises:
-          UnknownNameError: no such kind.
+          UnknownNameError: no such kind, or it has no such option.
         """
         from dmcvb_gen.loaders import torch_data
 
-        kinds = {
-            "steps": torch_data.StepDataset,
-            "transitions": torch_data.StepDataset,
-            "episodes": torch_data.EpisodeDataset,
-            "stream": torch_data.StreamDataset,
+        kinds: dict[str, tuple[Callable, Callable]] = {
+            "steps": (torch_data.StepDataset, StepSource),
+            "transitions": (torch_data.StepDataset, StepSource),
+            "episodes": (torch_data.EpisodeDataset, torch_data.EpisodeDataset),
+            "stream": (torch_data.StreamDataset, stream),
         }
         if kind not in kinds:
             raise UnknownNameError("kind of data set", kind, kinds)
+        made, takes = kinds[kind]
+        known = [name for name in inspect.signature(takes).parameters if name != "subset"]
+        if unknown := options.keys() - known:
+            raise UnknownNameError(f"option of torch({kind!r})", min(unknown), known)
         if kind == "transitions":
             options["next_step"] = True
-        return kinds[kind](self, **options)
+        return made(self, **options)
 
     def environment(self, **options: Any) -> Any:
         """The environment that matches the data: size, renderer, views, videos and time limit, with stacked frames.
@@ -129,7 +132,7 @@ class ReleaseReader(Release):
         return SubsetReader(self, record)
 
     def __getitem__(self, name: str) -> SubsetReader:
-        parts = self.parts_of(name)
+        parts = self.parts_of(name := str(name))
         return self.union(*parts) if parts else super().__getitem__(name)
 
     def union(self, *names: str) -> SubsetReader:

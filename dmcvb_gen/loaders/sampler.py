@@ -30,11 +30,11 @@ Views = Sequence[str] | Literal["agents"] | None
 `dmcvb_gen.evaluate` gives, which are all but the overhead view of mazes; (): states alone."""
 
 
-def _check_counts(**counts: int) -> None:
-    """Raises DmcvbError for a number below 1."""
+def _check_counts(least: int = 1, **counts: int) -> None:
+    """Raises DmcvbError for what is no whole number, or below the least one."""
     for name, value in counts.items():
-        if value < 1:
-            raise DmcvbError(f"{name} is {value}; give a whole number of at least 1")
+        if not isinstance(value, int | np.integer) or value < least:
+            raise DmcvbError(f"{name} is {value!r}; give a whole number of at least {least}")
 
 
 class StepSource:
@@ -94,10 +94,11 @@ class StepSource:
 
     def gather(self, indices: Sequence[int]) -> Steps:
         """Many steps as one batch: the arrays of an item, with a leading axis."""
-        places = np.asarray(indices, int)
-        if not len(self) or np.any((places < -len(self)) | (places >= len(self))):
-            raise IndexError(f"steps {places.tolist()} of {len(self)}")
-        places = places % len(self)
+        places = np.asarray(indices)
+        whole = places.dtype.kind in "iu" or not places.size
+        if not len(self) or not whole or np.any((places < -len(self)) | (places >= len(self))):
+            raise IndexError(f"steps {places.tolist()} of {len(self)}; give whole numbers, from {-len(self)} on")
+        places = places.astype(int) % len(self)
         if self.in_memory:
             return self.table.gather(self.table.steps[places], self.stack, self.next_step)
         items = [self._read(int(place)) for place in (places if len(places) else [0])]
@@ -160,6 +161,7 @@ def stream(
       DmcvbError: a number that is too small, or no episodes.
     """
     _check_counts(stack=stack, buffer=buffer, batch_size=1 if batch_size is None else batch_size)
+    _check_counts(0, seed=seed, epoch=epoch)
     names = shown(subset, pictures).arrays
     own = subset.choose(episodes)
     if not len(own):

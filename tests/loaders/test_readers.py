@@ -114,6 +114,9 @@ def test_the_source_is_numpy_alone_and_takes_any_index(subset):
             held[outside]
         with pytest.raises(IndexError):
             held.gather([0, outside])
+    for wrong in (np.array([0.5]), [True]):
+        with pytest.raises(IndexError, match="give whole numbers"):
+            held.gather(wrong)
 
 
 def test_whole_episodes_have_one_observation_more_than_actions(subset):
@@ -152,11 +155,25 @@ def test_a_mask_chooses_episodes_and_other_values_are_refused(subset):
     best = subset.returns == subset.returns.max()
     assert list(subset.choose(best)) == list(np.flatnonzero(best)) and best.sum() == 1
     assert set(subset.source(episodes=best, pictures=()).episodes) == set(np.flatnonzero(best))
-    for wrong in (best[:2], [0.5, 1.5], ["a"]):
+    for wrong in (best[:2], [0.5, 1.5], ["a"], 1, [[0, 1]]):
         with pytest.raises(DmcvbError, match="give indices, or a mask of all 3 episodes"):
             subset.choose(wrong)
     with pytest.raises(DmcvbError, match="no episodes are chosen"):
         list(subset.batches(4, episodes=[]))
+
+
+def test_a_part_has_its_episodes_in_the_order_in_which_they_are_given(subset):
+    part = subset.part([2, 0, 2])
+    assert list(part.episodes) == [2, 0, 2] and list(part.returns) == list(subset.returns[[2, 0, 2]])
+    np.testing.assert_array_equal(part[0]["action"], subset.episode(2)["action"])
+    assert [index for index, _ in part.each_episode(["action"])] == [2, 0, 2]
+    assert list(part.paired("none", "dynamic").episodes) == [2, 0, 2]
+    assert [int(e) for e in part.xarray()["episode"]] == [2, 0, 2]
+    [batch] = part.batches(10_000, pictures=(), shuffle=False)
+    np.testing.assert_array_equal(batch["episode"], np.repeat([2, 0, 2], 500))
+    painted = dmcvb_gen.open(subset.release.path, paint=True, distractors="resample")[NAME]
+    labels = painted.part([2, 0]).read("exogenous/camera_position")
+    np.testing.assert_array_equal(labels, painted.read("exogenous/camera_position", [2, 0]))
 
 
 def test_loader_workers_share_the_episodes(subset):
@@ -182,23 +199,33 @@ def test_persistent_workers_see_the_epoch(subset, context):
     assert orders[0] == orders[2] != orders[1] and set(orders[0]) == set(orders[1])
 
 
-def test_numbers_below_one_are_refused_by_name(subset):
+def test_values_that_make_no_sense_are_refused_by_name(subset):
     for make, words in (
-        (lambda: next(subset.batches(8, stack=0)), "stack is 0"),
-        (lambda: next(subset.batches(0)), "batch_size is 0"),
-        (lambda: next(subset.batches(8, buffer=0)), "buffer is 0"),
-        (lambda: subset.source(stack=-1), "stack is -1"),
-        (lambda: subset.torch("steps", stack=0), "stack is 0"),
+        (lambda: next(subset.batches(8, stack=0)), "stack is 0; give a whole number of at least 1"),
+        (lambda: next(subset.batches(8, stack="3")), "stack is '3'; give a whole number"),
+        (lambda: next(subset.batches(0)), "batch_size is 0; give a whole number"),
+        (lambda: next(subset.batches(2.5)), "batch_size is 2.5; give a whole number"),
+        (lambda: next(subset.batches(8, buffer=0)), "buffer is 0; give a whole number"),
+        (lambda: next(subset.batches(8, seed=-1)), "seed is -1; give a whole number of at least 0"),
+        (lambda: subset.source(stack=-1), "stack is -1; give a whole number"),
+        (lambda: subset.torch("steps", stack=0), "stack is 0; give a whole number"),
+        (lambda: dmcvb_gen.open(subset.release.path, distractors="resample"), "distractors says how .* paint=True"),
     ):
-        with pytest.raises(DmcvbError, match=f"{words}; give a whole number"):
+        with pytest.raises(DmcvbError, match=words):
             make()
 
 
 def test_wrong_names_are_answered_with_the_right_ones(subset, tmp_path):
     with pytest.raises(UnknownNameError, match="walker-walk/random/none"):
         subset.release["walker-walk/expert/none"]
+    for other in (0, None):
+        with pytest.raises(UnknownNameError, match=f"unknown subset '{other}'"):
+            subset.release[other]
     with pytest.raises(UnknownNameError, match="transitions"):
         subset.torch("rows")
+    for kind, option in (("steps", "batch_size"), ("stream", "in_memory")):
+        with pytest.raises(UnknownNameError, match=f"unknown option of torch\\('{kind}'\\) '{option}'"):
+            subset.torch(kind, **{option: 4})
     with pytest.raises(UnknownNameError, match="pixels"):
         subset.torch("steps", pictures=["depth"])
     assert subset.source(pictures="pixels")[0]["pixels"].shape == (9, 16, 16)  # one may be named alone
