@@ -26,7 +26,7 @@ from dmcvb_gen.options import (
     progress_bar,
 )
 from dmcvb_gen.parallel import Workers, ignore
-from dmcvb_gen.spec import is_maze, subset_name
+from dmcvb_gen.spec import SubsetSpec, is_maze, subset_name
 from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
@@ -154,6 +154,7 @@ def make(
     """
     import numpy as np
 
+    from dmcvb_gen.generate.request import EPISODES
     from dmcvb_gen.loaders import UnionReader, open_for_reading
 
     try:
@@ -166,8 +167,11 @@ def make(
             raise DmcvbError(f"{min(options)} has no effect: with a release, nothing is made; remove it")
         opened = open_for_reading(str(release))
     else:
+        levels = level.split("-")
+        setting = [SubsetSpec.parse(task, one, setting).setting for one in levels][0]
+        name, episodes = subset_name(task, level, setting), episodes or EPISODES
         options |= {"goals" if is_maze(task) else "distractors": setting, "seed": seed}
-        opened = _cached(task, tuple(level.split("-")), episodes, options)
+        opened = _cached(task, tuple(levels), episodes, options)
     train, val = [], []
     for part in opened.parts_of(name) or [name]:
         subset = opened[part]

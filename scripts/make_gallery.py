@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import dmcvb_gen
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.generate.preview import save_video, video_frames
+from dmcvb_gen.generate.preview import video_bytes, video_frames
 from dmcvb_gen.loaders.register import MAZES, TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,7 +47,7 @@ def moving(folder: Path, only: str, name: str, scale: int, episode: int | None =
     """An episode of some subsets side by side, as docs/gallery/<name>.webp."""
     release = Release.open(folder)
     subsets = [release[subset] for subset in release.select([only])]
-    save_video(PICTURES / f"{name}.webp", video_frames(subsets, scale, FRAMES, episode))
+    (PICTURES / f"{name}.webp").write_bytes(video_bytes(video_frames(subsets, scale, FRAMES, episode)))
 
 
 def styles(work: Path) -> None:

@@ -36,8 +36,8 @@ CARD_FOLDER = "card/"
 
 MANIFEST_BYTES, RECIPE_BYTES, COPY_BYTES = 2**26, 2**26, 2**24
 """Largest files of their kind that a reader takes."""
-MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**8, 10**5, 10**6, 10**4
-MAX_CHUNK_BYTES, MAX_SHARD_BYTES = 2**31, 2**37
+MAX_EPISODES, MAX_SHARDS, MAX_STEPS, MAX_SIZE = 10**7, 10**5, 10**6, 10**4
+MAX_CHUNK_BYTES, MAX_SHARD_BYTES, MAX_LIST_BYTES = 2**31, 2**37, 2**28
 """More than any release has; a manifest that asks for more is damaged or hostile."""
 PLAIN_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$"
 """A part of a path that leads nowhere else; exports make folders and files of versions and views."""
@@ -56,7 +56,7 @@ PlainName = Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME, max_le
 
 
 class _Model(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class FileRecord(_Model):
@@ -255,7 +255,7 @@ class SubsetRecord(_Model):
     size: int = pydantic.Field(gt=0, le=MAX_SIZE)
     deterministic: bool = False
     policies: tuple[PolicyRecord, ...] = ()
-    renderer: dict[str, Any] = {}
+    renderer: dict[PlainName, Line | bool | int | float | None] = {}
     backgrounds: dict[str, Any] | None = None
     family: PlainName = LOCOMOTION
     views: tuple[PlainName, ...] = pydantic.Field(default=("pixels",), min_length=1, max_length=100)
@@ -384,6 +384,8 @@ class Manifest(_Described):
             for layer in (named[name] for name in subset.layers):
                 if layer.kind != "images" and layer.shards * layer.episodes_per_shard < subset.episodes:
                     raise ValueError(f"{layer.name} has fewer episodes than {subset.name}")
+        if sum(subset.episodes for subset in self.subsets) > MAX_EPISODES:
+            raise ValueError(f"it has more episodes than the {MAX_EPISODES:,} that a release may have")
         if sum(layer.shards for layer in self.layers) > 10 * MAX_SHARDS:
             raise ValueError(f"it has more shards than the {10 * MAX_SHARDS:,} that a release may have")
         return self
@@ -468,7 +470,7 @@ def is_attachment(path: str) -> bool:
 
 def list_bytes_limit(layer: ListedLayer) -> int:
     """The largest list that a layer can have."""
-    return 1000 + layer.shards * record_bytes_limit(layer)
+    return min(1000 + layer.shards * record_bytes_limit(layer), MAX_LIST_BYTES)
 
 
 def record_bytes_limit(layer: Layer) -> int:

@@ -17,6 +17,7 @@ from dmcvb_gen.generate.recipe import Recipe
 from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
 from dmcvb_gen.generate.resolve import Resolution, resolve
 from dmcvb_gen.generate.works import Work, episodes_left, works_of
+from dmcvb_gen.options import refuse
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import as_names
@@ -75,6 +76,7 @@ def request_of(options: Options) -> Recipe | None:
     given = {name: value for name, value in options.items() if name in RECIPE_OPTIONS and _is_given(value)}
     tasks, recipe = as_names(options["tasks"]), options["recipe"]
     if options["out"] and not (tasks or recipe or given):
+        refuse("a release goes on as it was begun", no_pixels=not options["pixels"])
         return None
     return make_request(tasks, recipe, **given)
 

@@ -1,5 +1,6 @@
 """Write a contact sheet (PNG) and a video (WebP) of a release's episodes."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.options import Count, Local, Location, Names, checked
 from dmcvb_gen.spec import select
-from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path
+from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.text import as_names, quoted
 
 SHEET_COLUMNS, SHEET_EPISODES = 10, 8
@@ -144,17 +145,21 @@ def write_preview(
             cure = f"add them: dmcvb-gen paint {quoted(release)}, or see it without: dmcvb-gen view {quoted(release)}"
         raise StoreError(f"{release} has no finished episodes with images; {cure}")
     folder = local_path(out) if out else opened.path / "preview"
-    sheet, video = folder / "contact_sheet.png", folder / "preview.webp"
     few = episodes or max(1, min(4, SHEET_EPISODES // len(subsets)))
     picture = Image.fromarray(contact_sheet(subsets, few))
-    with storage_errors(folder, "write to"):
-        folder.mkdir(parents=True, exist_ok=True)
-        picture.save(sheet)
-        save_video(video, video_frames(subsets))
-    return [sheet, video]
+    sheet = io.BytesIO()
+    picture.save(sheet, "PNG")
+    files = {"contact_sheet.png": sheet.getvalue(), "preview.webp": video_bytes(video_frames(subsets))}
+    store = open_store(folder)  # which writes through no link
+    for name, data in files.items():
+        store.replace(name, data)
+    return [folder / name for name in files]
 
 
-def save_video(path: Path, frames: np.ndarray) -> None:
-    """Write (frame, height, width, 3) uint8 as a WebP."""
+def video_bytes(frames: np.ndarray) -> bytes:
+    """(frame, height, width, 3) uint8 as a WebP."""
+    video = io.BytesIO()
     first, *rest = map(Image.fromarray, frames)
-    first.save(path, save_all=True, append_images=rest, duration=1000 // VIDEO_FPS, loop=0, quality=60, method=5)
+    options = {"duration": 1000 // VIDEO_FPS, "loop": 0, "quality": 60, "method": 5}
+    first.save(video, "WEBP", save_all=True, append_images=rest, **options)
+    return video.getvalue()

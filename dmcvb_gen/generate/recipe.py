@@ -175,6 +175,8 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     unused = {level for pattern in recipe.subsets for level in pattern.policies if level not in pattern.levels}
     if unused:
         raise RecipeError(f"policies are given for level {sorted(unused)[0]!r}, which the recipe does not ask for")
+    if (episodes := sum(request.episodes for request in requests.values())) > MAX_EPISODES:
+        raise RecipeError(f"recipe {recipe.name!r} comes to {episodes:,} episodes; a release may have {MAX_EPISODES:,}")
     if (shards := sum(map(_shards, requests.values()))) > MAX_SHARDS:
         raise RecipeError(
             f"recipe {recipe.name!r} comes to {shards:,} shards, and a release may have {MAX_SHARDS:,}; give more "
@@ -204,8 +206,6 @@ def _request(pattern: SubsetPattern, task: Task, spec: SubsetSpec) -> SubsetRequ
         raise RecipeError(f"{name}: maze episodes vary in length, so give episodes: N instead of steps")
     else:
         episodes = -(-pattern.steps // max_steps)
-    if episodes > MAX_EPISODES:
-        raise RecipeError(f"{name}: {episodes:,} episodes are more than the {MAX_EPISODES:,} that a subset may have")
     return SubsetRequest(
         name=name,
         task=task.id,

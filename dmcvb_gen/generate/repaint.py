@@ -11,7 +11,7 @@ import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from dmcvb_gen.dataset.gate import Release, Shard, read_recipes
 from dmcvb_gen.dataset.manifest import Layer, Resolved, SubsetRecord
@@ -143,7 +143,7 @@ def _repainted(
     source = request.backgrounds or video_source(root, old)
     backend, samples = request.renderer or old.renderer["name"], request.samples
     if samples is None and backend == old.renderer["name"]:
-        samples = old.renderer.get("samples")
+        samples = cast("int | None", old.renderer.get("samples"))
     changes: dict[str, Any] = {
         "name": f"{old.name.rpartition('/')[0]}/{setting}",
         "setting": setting,

@@ -131,7 +131,7 @@ def with_renderer(recipe: Recipe, requests: Iterable[SubsetRequest], there: Rele
     backend = recipe.renderer.backend
     if backend is None and there is not None:
         begun = (record for record in there.manifest.subsets if record.task in tasks and not record.imported)
-        backend = next((record.renderer["name"] for record in begun), None)
+        backend = next((str(record.renderer["name"]) for record in begun), None)
     if backend is None:
         chosen = [default_renderer(get_task(task)) for task in tasks]
         backend = next((name for name in chosen if name != NATIVE), NATIVE)
@@ -165,7 +165,9 @@ def file_records(files: Mapping[str, Path]) -> tuple[FileRecord, ...]:
 def _episodes_per_shard(name: str, members: Sequence[SubsetRequest], there: Release | None) -> int:
     given = next((request.episodes_per_shard for request in members if request.episodes_per_shard), None)
     old = there.layers.get(f"{name}/trajectories") if there else None
-    if old is not None and not given:
+    if old is not None:
+        if given and given != old.episodes_per_shard:
+            _log.warning(f"{name}: shards keep their {old.episodes_per_shard} episodes, as they were begun")
         return old.episodes_per_shard
     most = max(request.episodes for request in members)
     return min(given, most) if given else shard_size(most, DEFAULT_EPISODES_PER_SHARD[get_task(members[0].task).family])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tracemalloc
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import pytest
 from numcodecs.zstd import Zstd
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import canonical_json
+from dmcvb_gen.dataset.manifest import MAX_LIST_BYTES, MAX_SHARDS, canonical_json, list_bytes_limit
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import open_store
@@ -91,7 +92,7 @@ ATTACKS: dict[str, Callable[[Path], None]] = {
     "an unknown dtype": _rewrite_manifest(lambda m: m["layers"][0]["arrays"][0].update(dtype="object")),
     "a group outside": _rewrite_manifest(lambda m: m["layers"][0].update(group="../../home")),
     "a chunk of terabytes": _rewrite_manifest(lambda m: m["layers"][0]["arrays"][0].update(shape=[10**7, 10**7])),
-    "more episodes than shards": _rewrite_manifest(lambda m: [s.update(episodes=10**8) for s in m["subsets"]]),
+    "more episodes than shards": _rewrite_manifest(lambda m: [s.update(episodes=10**6) for s in m["subsets"]]),
     "a subset twice": _rewrite_manifest(lambda m: m["subsets"].append(m["subsets"][0])),
     "names that differ in case alone": _rewrite_manifest(
         lambda m: m["subsets"].append(m["subsets"][0] | {"name": m["subsets"][0]["name"].upper()})
@@ -111,6 +112,23 @@ ATTACKS: dict[str, Callable[[Path], None]] = {
     "a chunk that is a device": _replaced(lambda path: path.symlink_to("/dev/zero"), _chunk),
     "a chunk that is a link": _replaced(_link_out, _chunk),
     "a chunk that decodes to 512 MB": _bomb,
+}
+
+
+def _many_episodes(manifest: dict) -> None:
+    manifest["layers"] = [layer | {"shards": 10**5, "episodes_per_shard": 50} for layer in manifest["layers"]]
+    manifest["subsets"] = [manifest["subsets"][0] | {"name": f"hop/{n}", "episodes": 4 * 10**6} for n in range(3)]
+
+
+def _infinite(root: Path) -> None:
+    text = _manifest_file(root).read_text()
+    _manifest_file(root).write_text(re.sub(r'"seconds_per_step":[0-9.]+', '"seconds_per_step":1e999', text))
+
+
+REFUSED = {
+    "more episodes than the 10,000,000": _rewrite_manifest(_many_episodes),
+    "seconds_per_step": _infinite,
+    "renderer.samples": _rewrite_manifest(lambda m: m["subsets"][0].update(renderer={"samples": "\x1b]0;x\x07"})),
 }
 
 
@@ -135,3 +153,17 @@ def test_an_attack_is_one_line(sound, tmp_path, name):
     tracemalloc.stop()
     assert "\n" not in str(caught.value) and "\x1b" not in str(caught.value)
     assert peak < 2**28
+
+
+@pytest.mark.parametrize("said", REFUSED)
+def test_numbers_and_names_have_bounds(sound, tmp_path, said):
+    shutil.copytree(sound, tmp_path / "release")
+    REFUSED[said](tmp_path / "release")
+    with pytest.raises(StoreError, match=said):
+        Release.open(tmp_path / "release")
+
+
+def test_the_bound_of_a_list_does_not_grow_with_its_layer(sound):
+    layer = next(iter(Release.open(sound).layers.values()))
+    many = layer.model_copy(update={"shards": MAX_SHARDS, "arrays": layer.arrays * 1000})
+    assert list_bytes_limit(many) == MAX_LIST_BYTES

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.preview import LABEL_HEIGHT, VIDEO_SIDE, episode_strip, video_frames, write_preview
 
 
@@ -40,3 +43,14 @@ def test_each_row_of_a_maze_has_a_label_above_it(maze_release, small_release):
         label = strip[LABEL_HEIGHT + row * (LABEL_HEIGHT + 32) :][:LABEL_HEIGHT]
         assert label.min() < 60 and (label == 255).mean() > 0.8, row  # dark text on white
     assert episode_strip(walker, 0, columns=20, scale=2).shape[0] == LABEL_HEIGHT + 32
+
+
+def test_a_preview_is_written_through_no_link(small_release, tmp_path):
+    shutil.copytree(small_release, tmp_path / "r")
+    (tmp_path / "r/preview").mkdir(exist_ok=True)
+    (tmp_path / "victim").write_text("mine")
+    (tmp_path / "r/preview/contact_sheet.png").unlink(missing_ok=True)
+    (tmp_path / "r/preview/contact_sheet.png").symlink_to(tmp_path / "victim")
+    with pytest.raises(StoreError, match="is a link"):
+        write_preview(tmp_path / "r")
+    assert (tmp_path / "victim").read_text() == "mine"

@@ -11,7 +11,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.info import describe_release
 from tests.conftest import TINY_MAZE
 
-NAMES = ["walker-walk/expert/dynamic", f"{TINY_MAZE}/random/visible", "walker-walk/random-expert/none"]
+NAMES = ["walker-walk/expert/dynamic_medium", f"{TINY_MAZE}/random/visible", "walker-walk/random-expert/none"]
 SHORT = dict(size=16, max_steps=6, progress=False)
 
 
@@ -31,9 +31,10 @@ def test_one_call_gives_data_and_their_environment_and_makes_them_once(name, tmp
     digest = Release.open(folder).digest
     again = dmcvb_gen.make(name, episodes=5, **SHORT)
     assert [*again.train.episodes] == [*train.episodes] and Release.open(folder).digest == digest
-    grown = dmcvb_gen.make(name, episodes=6, **SHORT)
-    assert len(grown.train) + len(grown.val) == 6 * levels and len(list(folder.parent.iterdir())) == 1
-    same = dmcvb_gen.make(name, episodes=5, release=folder)
+    for asked, count in ((22, 22), (None, 20)):
+        grown = dmcvb_gen.make(name, episodes=asked, **SHORT)
+        assert len(grown.train) + len(grown.val) == count * levels and len(list(folder.parent.iterdir())) == 1
+    same = dmcvb_gen.make(name.removesuffix("_medium"), episodes=5, release=folder)
     assert np.array_equal(same.val.read("state"), val.read("state")) and len(same.train) == len(train)
 
 
