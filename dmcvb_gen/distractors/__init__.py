@@ -5,15 +5,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.distractor_state import LABEL_DTYPES, DistractorState
+from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES, OPTIONAL_LABELS, DistractorState
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
 from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene, floor_alpha_for
 from dmcvb_gen.distractors.registry import BUILT_IN, distractors_of
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks.base import Task
+
+ROUNDING = 1e-4
+"""Labels of an episode may differ by so much with the episodes beside it, as sums round by their sizes."""
 
 
 class DistractorSampler:
@@ -38,7 +45,10 @@ class DistractorSampler:
     ):
         self.task, self.setting, self.frames = task, setting, frames
         self._scene = Scene(task, setting, len(generators["style"]), frames, backgrounds, split)
-        self._drawn = [distractor(self._scene, generators[distractor.stream]) for distractor in distractors_of(setting)]
+        kinds = distractors_of(setting)
+        self.own = " and ".join(f"{kind.__module__}:{kind.__name__}" for kind in kinds if kind not in BUILT_IN)
+        with self._told():
+            self._drawn = [distractor(self._scene, generators[distractor.stream]) for distractor in kinds]
         given = {name for distractor in self._drawn for name in distractor.names}
         self._left_out = [distractor for distractor in BUILT_IN if not given.issuperset(distractor.names)]
 
@@ -51,7 +61,15 @@ class DistractorSampler:
           physics: (episode, frame, physics) float64, or (episode, physics) at that frame.
           actions: (..., action), those before each frame; zeros before the first one, or if None.
         """
-        frames = slice(physics.shape[1]) if frame is None else frame
+        with self._told():
+            found = self._found(physics, actions, slice(physics.shape[1]) if frame is None else frame)
+            if self.own:
+                self._check(found, physics.shape[:-1])
+        return DistractorState(
+            **{name: found[name].astype(LABEL_DTYPES[name]) for name in LABEL_DTYPES if name in found}
+        )
+
+    def _found(self, physics: np.ndarray, actions: np.ndarray | None, frames: int | slice) -> dict[str, Any]:
         found: dict[str, np.ndarray] = {}
         for nominal in self._left_out:
             found.update(nominal.nominal(self._scene, physics))
@@ -61,9 +79,57 @@ class DistractorSampler:
             actions = np.zeros((*physics.shape[:-1], self.task.action_size))
         for distractor in self._drawn:
             distractor.adjust(found, actions, frames)
-        return DistractorState(
-            **{name: found[name].astype(LABEL_DTYPES[name]) for name in LABEL_DTYPES if name in found}
-        )
+        return found
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """An exception of the user's own code becomes one line."""
+        try:
+            yield
+        except Exception as error:
+            if not self.own or isinstance(error, DmcvbError):
+                raise
+            reason = (str(error).splitlines() or [""])[0]
+            raise DmcvbError(f"distractor {self.own} failed ({type(error).__name__}: {reason})") from error
+
+    def _check(self, found: dict[str, Any], lead: tuple[int, ...]) -> None:
+        """Refuse labels that cannot be stored, or that no picture shows.
+
+        Args:
+          lead: (episode, frame) or (episode,).
+        """
+        sizes = {"view": len(self.task.views), "material": len(self.task.material_colors)}
+        sizes |= {"xyz": 3, "wxyz": 4, "rgb": 3}
+        for name in LABEL_DTYPES:
+            if name not in found:
+                if name in OPTIONAL_LABELS:
+                    continue
+                raise DmcvbError(f"distractor {self.own} gives no {name}; give it, or leave it out of `names`")
+            found[name] = values = np.asarray(found[name])
+            shape = (*lead, *(sizes[dimension] for dimension in LABEL_DIMENSIONS[name]))
+            if values.shape != shape or values.dtype.kind not in "fiu":
+                raise DmcvbError(
+                    f"distractor {self.own} gives {name} as {values.dtype} of shape {values.shape}; give numbers of "
+                    f"shape {shape}"
+                )
+            low, high = self._range(name, found)
+            if not ((low <= values) & (values <= high)).all():  # NaN is in no range
+                raise DmcvbError(
+                    f"distractor {self.own} gives {name} from {values.min()} to {values.max()}; give finite numbers "
+                    f"from {np.min(low)} to {np.max(high)}"
+                )
+
+    def _range(self, name: str, found: Mapping[str, np.ndarray]) -> tuple[Any, Any]:
+        """The least and the largest value of a label."""
+        lengths = self._scene.backgrounds.lengths if self._scene.backgrounds else ()
+        if name == "background_video":
+            return -1, len(lengths) - 1
+        if name == "background_frame":
+            video = found["background_video"].astype(int)
+            return np.minimum(video, 0), np.append(lengths, 0)[video] - 1
+        dtype = np.dtype(LABEL_DTYPES[name])
+        limits = np.finfo(dtype) if dtype.kind == "f" else np.iinfo(dtype)
+        return {"material_rgb": (0, 1), "camera_quaternion": (-1, 1)}.get(name, (limits.min, limits.max))
 
 
 def sample_distractors(
@@ -87,8 +153,25 @@ def sample_distractors(
     Returns:
       Labels with leading shape (episode, frame); an episode's labels depend on its own streams and states only,
       and a longer episode begins with the labels of a shorter one.
+
+    Raises:
+      DmcvbError: a user's own distractor fails, or gives labels that are not so.
     """
-    return DistractorSampler(task, setting, physics.shape[1], generators, backgrounds, split).labels(physics, actions)
+    alone = {name: [copy.deepcopy(streams[-1])] for name, streams in generators.items()}
+    sampler = DistractorSampler(task, setting, physics.shape[1], generators, backgrounds, split)
+    labels = sampler.labels(physics, actions)
+    if sampler.own:
+        part = np.s_[-1:, : 1 + physics.shape[1] // 2]
+        frames = physics[part].shape[1]
+        again = DistractorSampler(task, setting, frames, alone, backgrounds, split)
+        found = again.labels(physics[part], None if actions is None else actions[part])
+        for (name, values), (_, wanted) in zip(found.items(), labels[part].items(), strict=True):
+            if not np.allclose(values, wanted, atol=ROUNDING):
+                raise DmcvbError(
+                    f"distractor {sampler.own} gives other {name} for the same episode; draw from its generator alone, "
+                    "row by row, and let a longer episode begin with the shorter one"
+                )
+    return labels
 
 
 __all__ = [

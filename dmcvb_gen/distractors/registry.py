@@ -61,11 +61,16 @@ def distractors_of(setting: DistractorSetting) -> tuple[type[Distractor], ...]:
 
 
 def _checked(distractor: Any, kind: str) -> type[Distractor]:
-    if not isinstance(distractor, type) or not issubclass(distractor, Distractor) or kind not in distractor.kinds:
+    if (
+        not isinstance(distractor, type)
+        or not issubclass(distractor, Distractor)
+        or kind not in getattr(distractor, "kinds", ())
+    ):
         raise DmcvbError(
             f"{distractor!r} is no distractor {kind!r}; give a subclass of Distractor with kinds = ({kind!r},)"
         )
     known = [name for name in DISTRACTOR_STATE_NAMES if name not in OPTIONAL_LABELS]
-    if not set(distractor.names) <= set(known) or distractor.stream not in seeding.STREAMS:
+    names, stream = (getattr(distractor, name, None) for name in ("names", "stream"))
+    if names is None or not set(names) <= set(known) or stream not in seeding.STREAMS:
         raise DmcvbError(f"{distractor!r}: give names out of {known}, and a stream out of {seeding.STREAMS}")
     return distractor

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from scipy.stats import ks_2samp, kstest
 
-from dmcvb_gen.distractors import DistractorSetting, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import Distractor, DistractorSetting, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
+from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.own_code import DISTRACTORS
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
@@ -196,6 +198,53 @@ def test_an_episodes_labels_depend_on_nothing_but_itself(frames, setting):
     alone = labels(task, setting, physics[1:2, :frames], episodes=[1])
     for (name, a), (_, b) in zip(whole.items(), alone.items(), strict=True):
         np.testing.assert_array_equal(a[1:2, :frames], b, err_msg=name)
+
+
+class Own(Distractor):
+    """Colors that a test draws: (frames, material, 3) -> those of one episode, from its generator."""
+
+    kinds, stream, names = ("own",), "color", ("material_rgb",)
+    made = []
+
+    def __init__(self, scene, generators):
+        self.made.append(len(generators))
+        shape = scene.frames, *scene.task.material_colors.shape
+        drawn = self.draw([rng.uniform(size=shape) for rng in generators])
+        self.drawn = drawn if isinstance(drawn, dict) else {"material_rgb": drawn}
+
+    def draw(self, colors):
+        return np.stack(colors)
+
+
+WRONG = {
+    "count": (lambda self, colors: np.stack(colors) / len(self.made), "gives other material_rgb for the same episode"),
+    "no seed": (lambda self, colors: np.random.random(np.shape(colors)), "gives other material_rgb"),
+    "neighbors": (lambda self, colors: colors - np.min(colors, axis=0), "gives other material_rgb"),
+    "last frame": (lambda self, colors: np.array(colors)[:, ::-1], "gives other material_rgb"),
+    "NaN": (lambda self, colors: np.full_like(colors, np.nan), "from nan to nan; give finite numbers from 0 to 1"),
+    "huge": (lambda self, colors: np.full_like(colors, 1e30), "from 1e.30 to 1e.30; give finite numbers from 0 to 1"),
+    "negative": (lambda self, colors: -np.array(colors), "give finite numbers from 0 to 1"),
+    "short": (lambda self, colors: np.array(colors)[:, 1:], "of shape .2, 40, 13, 3.; give numbers of shape .2, 41,"),
+    "one": (lambda self, colors: np.array(colors)[:, 0], "as float64 of shape .2, 13, 3.; give numbers of shape"),
+    "flat": (lambda self, colors: np.zeros(2), "failed .IndexError: too many"),
+    "words": (lambda self, colors: np.full(np.shape(colors), "red"), "as <U3 of shape"),
+    "nothing": (lambda self, colors: {}, "gives no material_rgb; give it, or leave it out of `names`"),
+    "list": (lambda self, colors: {"material_rgb": colors}, "failed .TypeError: list indices"),
+    "fails": (lambda self, colors: colors["red"], "failed .TypeError: list indices"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_distractor_of_ones_own_that_gives_other_labels_than_it_should_is_named(wrong, monkeypatch):
+    monkeypatch.setenv(DISTRACTORS, f"{__name__}:Own")
+    task = get_task("walker-walk")
+    physics = np.repeat(physics_of(task, 2, 1), 41, axis=1)
+    assert np.ptp(labels(task, "own", physics).material_rgb) > 0.9
+    draw, words = WRONG[wrong]
+    monkeypatch.setattr(Own, "draw", draw)
+    with pytest.raises(DmcvbError, match=words) as caught:
+        labels(task, "own", physics)
+    assert str(caught.value).startswith(f"distractor {__name__}:Own ") and "\n" not in str(caught.value)
 
 
 def test_difficulty_decides_how_many_videos_are_in_play():
