@@ -57,12 +57,9 @@ def main() -> None:
         run = open_run(folder, config, False)
         began = time.process_time()
 
-        def report(progress) -> None:
-            minutes = (time.process_time() - began) / 60
-            mean = progress.evaluation.mean
-            print(
-                f"{ACTION_REPEAT * progress.step:,} frames, {minutes:.1f} core-minutes: return {mean:.0f}", flush=True
-            )
+        def report(evaluation) -> None:
+            minutes, mean = (time.process_time() - began) / 60, evaluation.mean
+            print(f"{ACTION_REPEAT * run.step:,} frames, {minutes:.1f} core-minutes: return {mean:.0f}", flush=True)
             if mean < goal:
                 return
             newest = max((folder / "checkpoints").glob("[0-9]*.safetensors"))
