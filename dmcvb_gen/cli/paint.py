@@ -11,7 +11,7 @@ from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.release.fetch import download
 from dmcvb_gen.release.fetch import fetch as run_fetch
-from dmcvb_gen.text import pluralize
+from dmcvb_gen.text import pluralize, printable
 
 
 @command_of(making.paint)
@@ -50,7 +50,7 @@ def fetch(as_json, **options):
 
 def _tell(text):
     """Print a difference to the machine that made the release, apart from the output."""
-    click.echo(f"note: {text}", err=True)
+    click.echo(f"note: {printable(text, ' ')}", err=True)
 
 
 def _painted_facts(done):

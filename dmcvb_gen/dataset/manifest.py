@@ -21,6 +21,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
+from typing_extensions import TypedDict
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json, sha256_bytes
@@ -227,6 +228,20 @@ class PolicyRecord(_Model):
     header: dict[str, Any] = {}
 
 
+@pydantic.with_config(pydantic.ConfigDict(extra="forbid"))
+class _ShownVideos(TypedDict):
+    """The videos of a subset: "builtin" or the release's folder of them, their split, SHA-256 of their frames."""
+
+    source: RelativePath
+    split: Literal["train", "val"]
+    digest: Digest
+
+
+ShownVideos = Annotated[
+    dict[str, Any], pydantic.GetPydanticSchema(lambda _, handler: handler.generate_schema(_ShownVideos))
+]
+
+
 class SubsetRecord(_Model):
     """One subset: the episodes of a task and level under one setting.
 
@@ -256,7 +271,7 @@ class SubsetRecord(_Model):
     deterministic: bool = False
     policies: tuple[PolicyRecord, ...] = ()
     renderer: dict[PlainName, Line | bool | int | float | None] = {}
-    backgrounds: dict[str, Any] | None = None
+    backgrounds: ShownVideos | None = None
     family: PlainName = LOCOMOTION
     views: tuple[PlainName, ...] = pydantic.Field(default=("pixels",), min_length=1, max_length=100)
     hidden_goal: bool = False

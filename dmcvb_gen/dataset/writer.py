@@ -11,8 +11,9 @@ error. Only the manifest and what follows from it (zarr.json, copy.json) are rep
 from __future__ import annotations
 
 import datetime
+import itertools
 import secrets
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,11 @@ def begin(store: Store, recipe: Resolved, inputs: Mapping[str, Path | bytes]) ->
         raise StoreError(f"{store.place} is a copy of a release and does not grow; choose another --out")
     check_agree([*there, recipe])
     for file in recipe.inputs:
+        if file_facts(inputs[file.path]).at(file.path) != file:
+            raise StoreError(
+                f"the file for {file.path} is not the one that the recipe names; give the videos that it was made with "
+                "(--backgrounds FOLDER)"
+            )
         put(store, file.path, inputs[file.path])
     put(store, f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe))
 
@@ -202,7 +208,7 @@ def put_back(store: Store, file: FileRecord, data: bytes | Path) -> None:
       StoreError: it has other bytes.
     """
     mine = file_facts(data)
-    if (mine.bytes, mine.sha256) != (file.bytes, file.sha256):
+    if mine.at(file.path) != file:
         raise StoreError(
             f"{file.path} was made by {makers(store)} and cannot be made with {_versions(environment())}: SHA-256 "
             f"{mine.sha256[:12]} instead of {file.sha256[:12]}; nothing was changed"
@@ -308,7 +314,7 @@ def _add_layer(nodes: dict[str, dict[str, Any]], release: Release, subset: Subse
         folder = path.rpartition("/")[0]
         if folder != layer.group:
             nodes.setdefault(folder, _group({}))
-        episodes = min(subset.episodes, len(release.records(layer.name)) * layer.episodes_per_shard)
+        episodes = min(subset.episodes, (max(release.records(layer.name)) + 1) * layer.episodes_per_shard)
         episodes = max(episodes, nodes.get(path, {}).get("shape", (0,))[0])
         nodes[path] = parse_json(canonical_json(array_metadata(layer, spec, episodes).to_dict()))
 
@@ -372,14 +378,18 @@ def write_provenance(store: Store, command: str, **facts: Any) -> None:
     store.create(f"{PROVENANCE}{now:%Y%m%dT%H%M%SZ}-{secrets.token_hex(4)}.json", canonical_json(content))
 
 
-def read_provenance(store: Store) -> list[dict[str, Any]]:
-    """Notes of all processes that wrote to a release, oldest first; what is no note is left out."""
-    notes = []
-    for path in sorted(store.list(PROVENANCE)):
-        note = parse_json(store.read(path, PROVENANCE_BYTES))
-        if isinstance(note, dict) and isinstance(note.get("environment"), dict):
-            notes.append(note)
-    return notes
+def read_provenance(store: Store) -> Iterator[dict[str, Any]]:
+    """Notes of all processes that wrote to a release, oldest first, each read when it is asked for.
+
+    No digest covers them: what is no note is left out, and so is what is no text in its environment.
+    """
+    for path, size in sorted(store.list(PROVENANCE).items()):
+        try:
+            note = parse_json(store.read(path, PROVENANCE_BYTES)) if size <= PROVENANCE_BYTES else None
+        except ValueError:
+            continue
+        if isinstance(note, dict) and isinstance(made := note.get("environment"), dict):
+            yield note | {"environment": {name: value for name, value in made.items() if isinstance(value, str)}}
 
 
 def makers(store: Store) -> str:
@@ -391,7 +401,7 @@ def makers(store: Store) -> str:
 def check_versions(store: Store) -> None:
     """Raises StoreError if a package has another version here than where a release was begun."""
     here = environment()
-    for note in read_provenance(store)[:1]:
+    for note in itertools.islice(read_provenance(store), 1):
         for name, version in here.items():
             begun = note["environment"].get(name, version)
             if name not in ("system", "cpu") and begun != version:

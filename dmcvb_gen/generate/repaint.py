@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, cast
 
 from dmcvb_gen.dataset.gate import Release, Shard, read_recipes
-from dmcvb_gen.dataset.manifest import Layer, Resolved, SubsetRecord
-from dmcvb_gen.dataset.writer import begin, finish, put, put_record, write_provenance
+from dmcvb_gen.dataset.manifest import VIDEOS, Layer, Resolved, SubsetRecord
+from dmcvb_gen.dataset.writer import begin, finish, put, put_record, write_provenance, wrong_bytes
 from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.executors import run_works
-from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
+from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
 from dmcvb_gen.generate.paint import bare, recipe_after
 from dmcvb_gen.generate.render import check_renderer
 from dmcvb_gen.generate.resolve import (
@@ -140,7 +140,7 @@ def _repainted(
     trajectories = bare(release.layers[old.layers[0]])
     setting = _new_setting(old, request.distractor)
     root = local_inputs(release.store, release.inputs_of([old.name]))
-    source = request.backgrounds or video_source(root, old)
+    source = request.backgrounds or _own_videos(release, root, old)
     backend, samples = request.renderer or old.renderer["name"], request.samples
     if samples is None and backend == old.renderer["name"]:
         samples = cast("int | None", old.renderer.get("samples"))
@@ -159,6 +159,15 @@ def _repainted(
     labels = labels_layer(record, trajectories)
     images = image_layers(record, labels, all_pictures(record))
     return record, [trajectories, labels, *images, *modality_layers(record, labels, dict.fromkeys(request.labels))]
+
+
+def _own_videos(release: Release, root: Path, old: SubsetRecord) -> str:
+    """The videos that a subset shows, once those of both splits were compared with their digests."""
+    source = background_source(root, old)
+    for file in release.inputs_of([old.name]):
+        if file.path.startswith(VIDEOS) and (wrong := wrong_bytes(release.store, file)):
+            raise StoreError(f"{release.place}/{file.path} {wrong}; run `dmcvb-gen regenerate {release.place}`")
+    return source
 
 
 def _new_setting(old: SubsetRecord, distractor: str | None) -> str:

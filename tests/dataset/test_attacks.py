@@ -98,6 +98,9 @@ ATTACKS: dict[str, Callable[[Path], None]] = {
         lambda m: m["subsets"].append(m["subsets"][0] | {"name": m["subsets"][0]["name"].upper()})
     ),
     "a name that clears the screen": _rewrite_manifest(lambda m: m.update(license="\x1b[2J")),
+    "videos outside": _rewrite_manifest(
+        lambda m: m["subsets"][0].update(backgrounds={"source": "../home", "split": "train", "digest": "0" * 64})
+    ),
     "a layer that is not described": _rewrite_manifest(lambda m: m["subsets"][0]["layers"].append("hop/none")),
     "another list": _rewrite_manifest(lambda m: m["layers"][0].update(list="0" * 64)),
     "deep JSON": lambda root: _manifest_file(root).write_bytes(b"[" * 10**6),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import pickle
 
 import numpy as np
@@ -17,6 +18,7 @@ from dmcvb_gen.dataset.writer import (
     finish,
     put_back,
     put_shard,
+    read_provenance,
     write_provenance,
     wrong_bytes,
 )
@@ -88,6 +90,16 @@ def test_images_are_added_as_further_layers(store):
     assert here.items() <= {layer.name: layer.list for layer in painted.manifest.layers}.items()
 
 
+def test_plain_readers_see_images_that_are_not_the_first(store):
+    made_up.make(store, made_up.recipe(5, images=False))
+    wanted = made_up.recipe(5)
+    begin(store, wanted, {})
+    layer = wanted.layers[2]
+    put_shard(store, layer, 1, made_up.values(layer, 1))
+    finish(store)
+    assert json.loads((store.folder / layer.group / "pixels/zarr.json").read_bytes())["shape"][0] == 4
+
+
 GROWTHS = [made_up.recipe(2), made_up.recipe(5), made_up.recipe(4, ["none"]), made_up.recipe(3, images=False)]
 
 
@@ -147,6 +159,13 @@ def test_a_folder_of_something_else_is_no_place_for_a_release(store):
     (store.folder / "thesis.tex").write_text("x")
     with pytest.raises(StoreError, match=r"other files \(thesis.tex\); choose an empty place"):
         begin(store, made_up.recipe(2), {})
+
+
+def test_what_is_no_note_of_provenance_is_left_out(store):
+    write_provenance(store, "test")
+    for name, junk in {"0": b"garbage", "1": b"[]", "9": b'{"environment":{"cpu":["a"]}}'}.items():
+        store.create(f"provenance/{name}.json", junk)
+    assert [{*map(type, note["environment"].values())} for note in read_provenance(store)] == [{str}, set()]
 
 
 def test_repair_puts_back_recorded_bytes_alone(store):
