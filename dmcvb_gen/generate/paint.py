@@ -21,7 +21,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.resolve import all_pictures, image_layers, rendering_facts
-from dmcvb_gen.generate.works import can_be_rendered, works_of
+from dmcvb_gen.generate.works import can_be_rendered, chosen_subsets, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import HIDDEN
@@ -115,13 +115,14 @@ def paint_release(
     sources = {record.name: background_source(root, record, backgrounds) for record in records}
     drift = render_differences(release, records, sources)
     layers = {record.name: _layers_of(release, record, wanted, sources[record.name]) for record in records}
-    chosen = {layer.name for found in layers.values() for layer in found}
-    if chosen - release.layers.keys():
+    below = {layer.name: _labels(release, record).name for record in records for layer in layers[record.name]}
+    if below.keys() - release.layers.keys():
         begin(store, _recipe_with(release, records, layers), {})
         release = Release.open(store)
 
     def is_missing(layer: Layer, shard: int) -> bool:
-        return layer.name in chosen and can_be_rendered(release, layer, shard)
+        labels = below.get(layer.name)
+        return labels is not None and shard in release.here(labels) and can_be_rendered(release, layer, shard)
 
     works = works_of(release, [record.name for record in records], episodes, is_missing, backgrounds=backgrounds)
     for text in drift if works else ():
@@ -137,8 +138,7 @@ def paint_release(
 
 def _paintable(release: Release, only: Sequence[str], wanted: Wanted) -> list[SubsetRecord]:
     """The subsets to paint, once all that can be wrong with the request was looked at."""
-    names = set(release.select(only))
-    records = [record for record in release.manifest.subsets if record.name in names and not record.imported]
+    records = [record for record in chosen_subsets(release, only) if not record.imported]
     if not records:
         raise StoreError(f"{release.place} was imported and has no physics states to paint from")
     if wanted.goal and not any(get_task(record.task).goal_geoms for record in records):
@@ -148,10 +148,13 @@ def _paintable(release: Release, only: Sequence[str], wanted: Wanted) -> list[Su
 
 def _layers_of(release: Release, record: SubsetRecord, wanted: Wanted, source: str) -> list[Layer]:
     """The image layers that are asked for of a subset: the release's own, or new ones of the renderer here."""
-    labels = next(release.layers[name] for name in record.layers if release.layers[name].kind == "labels")
     here = record.model_copy(update=rendering_facts(record, source))
-    asked = image_layers(here, labels, wanted.pictures(record), wanted.size)
+    asked = image_layers(here, _labels(release, record), wanted.pictures(record), wanted.size)
     return [release.layers.get(layer.name, layer) for layer in asked]
+
+
+def _labels(release: Release, record: SubsetRecord) -> Layer:
+    return next(release.layers[name] for name in record.layers if release.layers[name].kind == "labels")
 
 
 def _recipe_with(release: Release, records: Iterable[SubsetRecord], layers: Mapping[str, Sequence[Layer]]) -> Resolved:
@@ -204,7 +207,7 @@ def environment_diff(store: Store) -> dict[str, tuple[str, str]]:
     """Compare this machine with all environments that made a release: name -> (there, here)."""
     here, made = environment(), [note["environment"] for note in read_provenance(store)]
     return {
-        name: (" or ".join(sorted({str(old.get(name, "unknown")) for old in made})), value)
+        name: (" or ".join(sorted({old.get(name, "unknown") for old in made})), value)
         for name, value in here.items()
         if any(name in old for old in made) and value not in {old.get(name) for old in made}
     }

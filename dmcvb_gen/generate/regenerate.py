@@ -15,6 +15,7 @@ from dmcvb_gen.dataset.gate import Release, read_records
 from dmcvb_gen.dataset.manifest import Layer, LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
 from dmcvb_gen.dataset.writer import (
     begin,
+    check_agree,
     finish,
     put,
     put_back,
@@ -30,7 +31,7 @@ from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
 from dmcvb_gen.generate.paint import environment_diff
 from dmcvb_gen.generate.resolve import video_files
 from dmcvb_gen.generate.shipped import Shipped, record_digests
-from dmcvb_gen.generate.works import Work, works_of
+from dmcvb_gen.generate.works import Work, chosen_subsets, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.store import NotThere, Store, open_store
@@ -102,13 +103,14 @@ class Regeneration:
         store = open_store(self.place)
         restored = restore_lists(store)
         release = Release.open(store)
-        faulty = self._faults(release)
+        faulty = self._faults(release, restored)
         works = self._works(release, lambda layer, shard: (layer.name, shard) in faulty, "repair")
         restored += self._restore_inputs(release)
         outcomes = self.run(works, progress)
         if works:
             write_provenance(store, "regenerate")
         write_plain_metadata(Release.open(store))
+        check_agree(release.recipes)  # nothing gives a recipe back
         return Outcome(outcomes, environment_diff(store), restored=tuple(restored))
 
     def remake(self, out: str | Path, progress: ProgressCallback = ignore) -> Outcome:
@@ -130,23 +132,28 @@ class Regeneration:
         results = run_works(works, self.workers, progress)
         return tuple(outcome for result in results for outcome in result.outcomes)
 
-    def _faults(self, release: Release) -> set[tuple[str, int]]:
-        """(layer, shard) of those whose record or files are not as listed."""
+    def _faults(self, release: Release, restored: list[str]) -> set[tuple[str, int]]:
+        """(layer, shard) of those whose files are not as listed; records are put back, and added to `restored`."""
         asked, found = bool(self.only or self.episodes), set[tuple[str, int]]()
         for shard in release.shards(release.select(self.only), self.episodes):
-            if not asked and release.copy is not None and not _is_promised(release, shard.layer.name, shard.number):
+            if not (asked or shard.here or _is_promised(release, shard.layer.name, shard.number)):
                 continue
-            lacks_record = release.store.size(shard.record_path) is None
-            if lacks_record or any(wrong_bytes(release.store, file) for file in shard.files):
+            damaged = any(wrong_bytes(release.store, file) for file in shard.files)
+            if damaged:
                 found.add((shard.layer.name, shard.number))
+            if wrong_bytes(release.store, shard.record_file) and (shard.here or not damaged):
+                put_back(release.store, shard.record_file, canonical_json(shard.record))
+                restored.append(shard.record_path)
         return found
 
     def _restore_inputs(self, release: Release) -> list[str]:
         """Put back policies and videos that are missing or damaged; their paths."""
-        broken = [file for file in release.manifest.inputs if wrong_bytes(release.store, file)]
+        records = chosen_subsets(release)
+        broken = [f for f in release.inputs_of([record.name for record in records]) if wrong_bytes(release.store, f)]
         if not broken:
             return []
-        files = input_files(release.store, release.manifest, self.backgrounds)
+        described = release.manifest.model_copy(update={"subsets": tuple(records), "inputs": tuple(broken)})
+        files = input_files(release.store, described, self.backgrounds)
         for file in broken:
             put_back(release.store, file, files[file.path])
         return [file.path for file in broken]
@@ -220,7 +227,8 @@ def check_makeable(described: Resolved | Manifest, names: Iterable[str]) -> None
 def restore_lists(store: Store) -> list[str]:
     """Write lists of layers again that are missing or damaged, from the records that are all there; their paths."""
     release, restored = Release.open(store), []
-    for layer in release.layers.values():
+    for name in dict.fromkeys(name for record in chosen_subsets(release) for name in record.layers):
+        layer = release.layers[name]
         if not isinstance(layer, ListedLayer):
             continue
         try:

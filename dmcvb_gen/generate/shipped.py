@@ -95,9 +95,4 @@ def pack(release: Release, out: str | Path) -> int:
 
 def record_digests(release: Release) -> dict[str, tuple[str, ...]]:
     """Layer -> SHA-256 of the record of each shard, in order."""
-    from dmcvb_gen.dataset.manifest import canonical_json
-
-    return {
-        name: tuple(sha256_bytes(canonical_json(record)) for _, record in sorted(release.records(name).items()))
-        for name in release.layers
-    }
+    return {name: tuple(shard.record_file.sha256 for shard in release.layer_shards(name)) for name in release.layers}

@@ -108,8 +108,7 @@ def works_of(
     Raises:
       UnknownNameError: a pattern fits nothing. StoreError: no subset has such episodes.
     """
-    names = set(release.select(only))
-    records = [record for record in release.manifest.subsets if record.name in names]
+    records = chosen_subsets(release, only)
     lacking = wanted or (lambda layer, shard: shard not in release.here(layer.name))
     found = []
     groups = list(_groups(release, records, episodes).items())
@@ -123,6 +122,26 @@ def works_of(
             work = Work(release.store, release.layers[name], shard, settings, make, known, inputs, **facts)  # type: ignore[arg-type]
             found.append(work)
     return tuple(found)
+
+
+def chosen_subsets(release: Release, only: Sequence[str] = ()) -> list[SubsetRecord]:
+    """The subsets that patterns choose, without those of which a copy has nothing and was to have nothing.
+
+    Raises:
+      UnknownNameError: a pattern fits nothing. StoreError: the copy has nothing of what is chosen.
+    """
+    names = set(release.select(only))
+    chosen = [record for record in release.manifest.subsets if record.name in names and _is_part(release, record)]
+    if not chosen:
+        raise StoreError(f"{release.place} is a copy without {min(names)}; fetch it first")
+    return chosen
+
+
+def _is_part(release: Release, record: SubsetRecord) -> bool:
+    if release.copy is None:
+        return True
+    own = record.layers[1:]  # its trajectories may be here for another setting
+    return any(release.here(name) or release.copy.promised.get(name) for name in own)
 
 
 def can_be_rendered(release: Release, layer: Layer, shard: int) -> bool:

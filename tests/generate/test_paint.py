@@ -12,6 +12,8 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.paint import Wanted, paint_release
+from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from tests.conftest import invoke, records, rewrite, wrong_files
 
@@ -54,12 +56,31 @@ def test_images_that_are_known_are_compared_and_others_are_named(painted_and_lig
     digest = Release.open(source).digest
     done = paint_release(tmp_path / "light")
     assert done.known == done.shards > 0 and not done.differing and done.release.digest == digest
+    chunk = next(path for path in (tmp_path / "light").rglob("pixels*/c/**/*") if path.is_file())
+    chunk.write_bytes(bytes(chunk.stat().st_size))
+    assert [shard.repaired for shard in Regeneration(tmp_path / "light").repair().shards] == [True]
     layer = next(layer for layer in Release.open(source).layers.values() if layer.kind == "images")
     array, name = layer.arrays[0].name, layer.name.rpartition("/")[0]
     rewrite(source, name, lambda arrays: arrays[array][2].fill(9))  # as if it had been made elsewhere
     publish(source, f"file:{tmp_path}/other", pixels=False)
-    assert f"differs: {layer.name} shard 1" in invoke("paint", tmp_path / "other", code=1).output
+    [note] = (tmp_path / "other/provenance").iterdir()
+    note.write_text(note.read_text().replace('"mujoco":"', '"mujoco":"\\u0007'))
+    said = invoke("paint", tmp_path / "other", code=1).output
+    assert f"differs: {layer.name} shard 1" in said and "note: mujoco is" in said and "\x07" not in said
     assert not (tmp_path / "other" / record_path(layer.name, 1)).exists()
+
+
+def test_a_part_is_painted_and_repaired_without_the_settings_that_share_its_trajectories(painted_and_light, tmp_path):
+    other, name = Release.open(painted_and_light / "light")
+    fetch(f"file:{painted_and_light / 'light'}", tmp_path / "part", [name])
+    done = paint_release(tmp_path / "part")
+    painted = Release.open(painted_and_light / "painted")[name]
+    assert done.shards == 2 * len(painted.pixel_arrays)
+    for layer in painted.layers:
+        assert done.release.records(layer.name) == painted.release.records(layer.name)
+    assert Regeneration(tmp_path / "part").check().sound and not Regeneration(tmp_path / "part").repair().shards
+    with pytest.raises(StoreError, match=f"is a copy without {other}"):
+        paint_release(tmp_path / "part", [other])
 
 
 def test_a_copy_gains_images_of_another_size_and_keeps_its_digest(painted_and_light, tmp_path):

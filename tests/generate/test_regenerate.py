@@ -11,7 +11,9 @@ from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import record_path
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.regenerate import Regeneration
+from dmcvb_gen.generate.repaint import Repainting, repaint
 from tests.conftest import invoke, rewrite, roll_out, short_recipe, small_recipe
 from tests.dataset.oracle import contents
 
@@ -60,8 +62,12 @@ def test_a_damaged_file_is_put_back_and_no_other_is_touched(copy, small_release,
     assert Regeneration(copy).repair().shards == ()
 
 
-def test_a_lost_record_a_lost_list_and_plain_metadata_are_put_back(copy, small_release):
-    (copy / record_path(f"{NAME}/pixels", 1)).unlink()
+def test_lists_records_and_plain_metadata_are_put_back_and_recipes_are_named(copy, small_release):
+    lost, altered = record_path(f"{NAME}/pixels", 1), record_path(f"{NAME}/labels", 0)
+    (copy / lost).unlink()
+    (copy / altered).write_text("{}")
+    outcome = Regeneration(copy, [NAME]).repair()
+    assert outcome.restored == (altered, lost) and not outcome.shards
     lost = next(iter((copy / "layers").iterdir()))
     lost.write_text("{}")
     shutil.rmtree(copy / GROUP / "dynamic/exogenous/style")
@@ -69,6 +75,9 @@ def test_a_lost_record_a_lost_list_and_plain_metadata_are_put_back(copy, small_r
     outcome = Regeneration(copy).repair()
     assert outcome.sound and outcome.restored == (f"layers/{lost.name}",)
     assert contents(copy) == contents(small_release)
+    next((copy / "recipes").iterdir()).write_text("{}")
+    with pytest.raises(StoreError, match="recipes/.* was altered"):
+        Regeneration(copy).repair()
 
 
 def change_actions(folder):
@@ -113,17 +122,25 @@ def test_beside_it_makes_an_equal_release_and_goes_on_in_what_has_grown(tmp_path
 
 
 def test_videos_and_policies_that_are_lost_are_put_back(tmp_path):
-    videos = tmp_path / "videos/train"
-    videos.mkdir(parents=True)
-    for number in range(2):
-        Image.fromarray(np.full((16, 16, 3), 90 * number, np.uint8)).save(videos / f"{number}.png")
+    for name, gray in {"train/0.png": 0, "train/1.png": 90, "val/0.png": 200}.items():
+        (tmp_path / "videos" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((16, 16, 3), gray, np.uint8)).save(tmp_path / "videos" / name)
     pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "static", "episodes": 1, "max_steps": 3}
     roll_out(small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "videos")), tmp_path / "r")
     before = contents(tmp_path / "r")
+    for name, message in {"train/00000.png": "are not those that", "val/00000.png": "run `dmcvb-gen reg"}.items():
+        [frame] = (tmp_path / "r/backgrounds").glob(f"*/{name}")
+        saved = frame.read_bytes()
+        Image.fromarray(np.full((16, 16, 3), 77, np.uint8)).save(frame)
+        with pytest.raises(StoreError, match=message):
+            repaint(Repainting(tmp_path / "r", tmp_path / "painted", size=8))
+        with pytest.raises(StoreError, match="png is not the one that the recipe names"):
+            Regeneration(tmp_path / "r").remake(tmp_path / "beside")
+        frame.write_bytes(saved)
     shutil.rmtree(tmp_path / "r/backgrounds")
     [policy] = (tmp_path / "r/policies").iterdir()
     policy.write_bytes(policy.read_bytes()[:20])
     command = ["regenerate", tmp_path / "r", "--backgrounds", tmp_path / "videos"]
-    assert "restored 3 other files" in invoke(*command, code=0).output
+    assert "restored 4 other files" in invoke(*command, code=0).output
     assert contents(tmp_path / "r") == before
     assert "no shard is damaged" in invoke(*command).output
