@@ -89,10 +89,18 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
     """
     if name not in allowed(variable):
         raise DmcvbError(f"{kind} {name} is code of your own; to let it run, set {variable}={name}")
+    refuse_file(kind, name)
     module, _, function = name.partition(":")
     if module == "__main__":
         raise DmcvbError(f"{kind} {name} lies in the script that runs; put it into a module that workers can import")
     return getattr(_import(module, f"{kind} {name}", function), function)
+
+
+def refuse_file(kind: str, name: str) -> None:
+    """Raise DmcvbError if a name has a file where its module should be."""
+    module, _, function = name.partition(":")
+    if module.endswith(".py"):
+        raise DmcvbError(f"{kind} {name} is a file; in its folder, give {Path(module).stem}:{function}")
 
 
 def import_plugins() -> None:
@@ -109,14 +117,18 @@ def _import(module: str, what: str, function: str | None = None) -> ModuleType:
     """A module of the user's own, which has that function if one is asked for."""
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
+    form = "<module>"
+    if function:
+        form += ":<Class>" if what.startswith("distractor ") else ":<function>"
     try:
         found = importlib.import_module(module)
-        if function:
-            getattr(found, function)
-        return found
-    except (ImportError, AttributeError) as error:
-        form = "<module>:<function>" if function else "<module>"
-        raise DmcvbError(f"cannot find {what} ({error}); give {form}, run from its folder") from None
+        if not function or hasattr(found, function):
+            return found
+        place = getattr(found, "__file__", None) or "a module of Python itself"
+        reason = f"{place} has no {function!r}; if that is not your file, rename yours"
+    except ImportError as error:
+        reason = str(error)
     except Exception as error:  # the user's code
         reason = (str(error).splitlines() or [""])[0]
         raise DmcvbError(f"{what} cannot be imported ({type(error).__name__}: {reason})") from error
+    raise DmcvbError(f"cannot find {what} ({reason}); give {form}, run from its folder")

@@ -211,5 +211,8 @@ def _means(seen: dict[str, list[torch.Tensor]], step: int) -> dict[str, float]:
     means = {name: float(sum(values)) / len(values) for name, values in seen.items()}
     for name, value in means.items():
         if not np.isfinite(value):
-            raise DmcvbError(f"{name} is no longer finite at step {step}; look at the data with `dmcvb-gen verify`")
+            raise DmcvbError(
+                f"{name} is no longer finite at step {step}; look at the agent's losses, and at the data with "
+                "`dmcvb-gen verify`"
+            )
     return means

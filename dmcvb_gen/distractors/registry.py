@@ -36,6 +36,7 @@ def typed_setting(name: str) -> str:
     if not colon:
         return name
     own, _, difficulty = rest.partition("_")
+    own_code.refuse_file("distractor", name)
     own_code.allow([f"{module}:{own}"], own_code.DISTRACTORS)
     distractors_of(DistractorSetting(own.lower()))
     return own.lower() + (f"_{difficulty}" if difficulty else "")

@@ -156,10 +156,20 @@ def simulate(
                 state = batch.reset(starts[places])
             else:
                 state = batch.reset_fixed(starts[places], [goal_pairs[k] for k in part.goal_pair.tolist()])
-            _step_to_the_end(batch, state, policies, noise[places], deterministic, part)
+            with np.errstate(over="ignore"):  # told below
+                _step_to_the_end(batch, state, policies, noise[places], deterministic, part)
+            _check_finite(task, part)
         except EpisodeError as error:
             raise error.of_episode(int(part.episodes[error.place])) from error
     return out
+
+
+def _check_finite(task: Task, made: Simulation) -> None:
+    """Raise EpisodeError if a task gave what is no finite number, or none once it is stored as float32."""
+    for name in ("state", "reward", "discount"):
+        finite = np.isfinite(getattr(made, name)).reshape(*made.reward.shape, -1).all(axis=2)
+        for place, step in np.argwhere(~finite).tolist():
+            raise EpisodeError(task.id, place, step, f"its {name} is no finite number of float32; make it one")
 
 
 class Replay(Policy):

@@ -30,6 +30,8 @@ PROBE_STEPS = 10
 """Agent steps of the episodes that the start's check compares."""
 PROBE_SEEDS = (0, 1)
 """Seeds of these episodes."""
+LARGEST = float(np.finfo(np.float32).max)
+"""Of what observations, rewards and discounts are stored as."""
 MAX_ENTRIES = 10_000
 """Values of a model's field that may change in an episode, at most: each row of `physics` holds them."""
 TERRAIN, TERRAIN_KEY = "hfield_data", 3
@@ -373,8 +375,9 @@ class _Episode:
                     self.check_model()
                     break
             self._observe(found.observation)
-        if not math.isfinite(total):
-            raise self.error(f"it gave the reward {total}; its reward must be a finite number")
+        for name, value in (("reward", total), ("discount", discount)):
+            if not abs(value) <= LARGEST:
+                raise self.error(f"it gave the {name} {value}; its {name} must be a finite number of float32")
         if (risen := self._warnings() > self._warned).any():  # a task may have hidden them
             raise self.error(diverged([mujoco.mjtWarning(kind).name for kind in np.array(BAD_STATES)[risen]]))
         self.steps += 1
@@ -444,8 +447,10 @@ class _Episode:
         """
         if self.task.trusted:
             observation = self.environment.task.observe(self.environment.physics)
-        if not isinstance(observation, Mapping) or not observation:
+        if not isinstance(observation, Mapping):
             raise self.error(f"it observes a {type(observation).__name__}; get_observation must give a dictionary")
+        if not observation:
+            raise self.error("it observes nothing; get_observation must give a dictionary of numbers")
         parts, fields = [np.ravel(value) for value in observation.values()], self.task.state_fields
         for name, part in zip(observation, parts, strict=True):
             if part.dtype.kind not in "biuf":
@@ -454,14 +459,17 @@ class _Episode:
         if not fields:
             self.task.state_fields = fields = sizes
         if list(sizes.items()) != list(fields.items()):
-            name = next((name for name in fields if sizes.get(name) != fields[name]), next(iter(sizes)))
-            raise self.error(
-                f"it observes {name!r} in different sizes ({fields.get(name)} and {sizes.get(name)}); fix it"
-            )
+            pairs = {name: (fields.get(name, 0), sizes.get(name, 0)) for name in (*fields, *sizes)}
+            for name, (before, now) in pairs.items():
+                if before != now:
+                    raise self.error(f"it observes {name!r} in different sizes ({before} and {now}); fix it")
+            raise self.error(f"it observes {list(sizes)} after {list(fields)}; keep their order")
         self.state = np.concatenate(parts, dtype=np.float64)
-        if not np.isfinite(self.state).all():
-            name = next(name for name, part in zip(observation, parts, strict=True) if not np.isfinite(part).all())
-            raise self.error(f"it observes {name!r} with values that are no finite numbers; give finite ones")
+        for name, part in zip(observation, parts, strict=True):
+            if not (np.abs(part) <= LARGEST).all():
+                raise self.error(
+                    f"it observes {name!r} with values that are no finite numbers of float32; give finite ones"
+                )
 
 
 class EnvironmentBatch(EpisodeBatch):

@@ -27,6 +27,8 @@ ROLLOUTS = [
     ("walker-walk --distracter none", "Did you mean '--distractor'?"),
     ("walker-walk --distractor static_cue0.5", "has no cue, shake or light"),
     ("walker-walk --distractor math:Nothing", "cannot find distractor math:Nothing"),
+    ("walker-walk --distractor dis:Base", "dis.py has no 'Base'; if that is not your file, rename yours"),
+    ("walker-walk --distractor a/mine.py:Base_hard", "is a file; in its folder, give mine:Base_hard"),
     ("walker-walk --distractor math:pi_hard", "is no distractor 'pi'"),
     ("walker-walk --size 0", "8 to 1024"),
     ("walker-walk --samples 3", "samples: Input should be 1, 2, 4 or 8"),

@@ -16,6 +16,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.simulate import replay, simulate
 from dmcvb_gen.seeding import episode_stream
+from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from tests.tasks import hostile_tasks as h
 from tests.tasks.hostile_tasks import having
@@ -59,7 +60,10 @@ REFUSED = {
     observed(lambda physics: {"arm": {"position": physics.data.qpos}}): "observes 'arm' as object; give numbers",
     h.early_quake: "changes hfield_data of the model in its episodes, which cannot be stored",
     observed(lambda physics: 1.0): "observes a float; get_observation must give a",
-    observed(lambda physics: {}): "observes a dict; get_observation must give a dictionary",
+    observed(lambda physics: {}): "observes nothing; get_observation must give a dictionary",
+    observed(lambda physics: dict.fromkeys("xy"[: 1 + (physics.time() > 0.1)], 0)): "'y' in different sizes .0 and 1.",
+    observed(lambda physics: {"x": np.full(2, 1e300)}): "'x' with values that are no finite numbers of float32",
+    rewarded(lambda physics: 1e300): "gave the reward .*e.300; its reward must be a finite number of float32",
     observed(lambda physics: {"x": np.zeros(1 + (physics.time() > 0.1))}): "observes 'x' in different sizes",
     observed(lambda physics: {"b" if physics.time() > 0.03 else "a": 0.0}): "observes 'a' in different sizes",
     observed(lambda physics: {"x": np.array([1.0, np.nan])}): "observes 'x' with values that are no finite numbers",
@@ -177,6 +181,13 @@ def test_what_cannot_be_repeated_or_stored_is_refused_in_one_line(case):
     with pytest.raises(DmcvbError, match=REFUSED[case]) as caught:
         rolled(task_of(case), [8])
     assert "\n" not in str(caught.value)
+
+
+def test_a_task_for_a_batch_is_refused_if_float32_does_not_hold_what_it_gives(monkeypatch):
+    task = get_task("walker-walk")
+    monkeypatch.setattr(type(task.batch(1)), "_control_reward", lambda batch: np.full(batch.size, 1e300))
+    with pytest.raises(DmcvbError, match="^task walker-walk, episode 8, step 0: its reward is no finite number"):
+        rolled(task, [8], max_steps=2)
 
 
 @pytest.mark.slow
