@@ -20,6 +20,7 @@ from dmcvb_gen.dataset.manifest import (
     COPY_BYTES,
     MANIFEST,
     MANIFEST_BYTES,
+    MANIFESTS,
     MAX_SHARDS,
     RECIPE_BYTES,
     RECIPES,
@@ -99,7 +100,10 @@ class Release:
       digest: SHA-256 of the manifest's bytes; None while it is made.
       compared: whether the digest was compared with one from outside.
       copy: what it was copied from, None if it is no copy.
+      manifest_path: where its manifest lies; in manifests/ if another one has replaced it.
     """
+
+    manifest_path = MANIFEST
 
     def __init__(
         self, store: Store, manifest: Manifest | Resolved, digest: str | None, compared: bool, copy: Copy | None
@@ -110,14 +114,19 @@ class Release:
 
     @classmethod
     def open(
-        cls, place: str | Path | Store, options: Mapping[str, Any] | None = None, digest: str | None = None
+        cls,
+        place: str | Path | Store,
+        options: Mapping[str, Any] | None = None,
+        digest: str | None = None,
+        own_images: bool = True,
     ) -> Self:
         """Open a release.
 
         Args:
           place: its folder or URL, or "<folder or URL>@sha256:<digest>".
           options: options of the storage client, for URLs.
-          digest: SHA-256 of the manifest, from a source that you trust.
+          digest: SHA-256 of the manifest, from a source that you trust; one that was replaced can still be opened.
+          own_images: False leaves images out that no manifest names, see `_with_own_images`.
 
         Raises:
           StoreError: there is no release, its manifest is damaged or has another digest.
@@ -126,27 +135,35 @@ class Release:
             if pinned := _PINNED.fullmatch(str(place)):
                 place, digest = pinned["place"], pinned["digest"]
             place = open_store(place, options)
-        store = place
+        store, path = place, MANIFEST
         try:
-            text = store.read(MANIFEST, MANIFEST_BYTES)
+            text = store.read(path, MANIFEST_BYTES)
         except NotThere:
             if digest is not None:
                 raise StoreError(f"{store.place} has no manifest, so it is not release {digest[:12]}") from None
             return cls.in_making(store)
         found = sha256_bytes(text)
-        if digest is not None and digest != found:
-            raise StoreError(
-                f"{store.place} is release {found}, not {digest}: do not use it for the one that you meant"
-            )
-        manifest = parse(Manifest, text, f"{store.place}/{MANIFEST}")
+        if digest not in (None, found):
+            path = f"{MANIFESTS}{digest}.json"
+            text = store.find(path, MANIFEST_BYTES) or b""
+            if sha256_bytes(text) != digest:
+                raise StoreError(
+                    f"{store.place} is release {found}, not {digest}: do not use it for the one that you meant"
+                )
+            found = digest
+        manifest = parse(Manifest, text, f"{store.place}/{path}")
         copy = cls.read_copy(store)
-        if copy is not None and copy.manifest != found:
+        # A copy's manifest is replaced after copy.json; until then the older one, which is kept first, is the release.
+        if copy is not None and copy.manifest != found and store.size(f"{MANIFESTS}{found}.json") is None:
             raise StoreError(
                 f"{store.place} is a copy of release {copy.manifest[:12]}, its manifest is {found[:12]}; fetch again"
             )
-        if store.folder is not None:
+        if own_images and path == MANIFEST and store.folder is not None:
             manifest = _with_own_images(store, manifest)
-        return cls(store, manifest, found, digest is not None or copy is not None, copy)
+        compared = digest is not None or (copy is not None and copy.manifest == found)
+        release = cls(store, manifest, found, compared, copy)
+        release.manifest_path = path
+        return release
 
     @classmethod
     def in_making(cls, store: Store) -> Self:
@@ -169,10 +186,8 @@ class Release:
     @staticmethod
     def read_copy(store: Store) -> Copy | None:
         """What a place is a copy of; None if it is none."""
-        try:
-            return parse(Copy, store.read(COPY, COPY_BYTES), f"{store.place}/{COPY}")
-        except NotThere:
-            return None
+        text = store.find(COPY, COPY_BYTES)
+        return None if text is None else parse(Copy, text, f"{store.place}/{COPY}")
 
     def __repr__(self) -> str:
         return f"<Release {self.manifest.name} {self.manifest.version}: {pluralize(len(self.subsets), 'subsets')}>"

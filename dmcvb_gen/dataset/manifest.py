@@ -420,6 +420,16 @@ class Copy(_Model):
     source: Line = ""
     promised: dict[RelativePath, tuple[tuple[int, int], ...]] = {}
 
+    @pydantic.model_validator(mode="after")
+    def _bounded(self) -> Copy:
+        for layer, each in self.promised.items():
+            bounds = [number for run in each for number in run]
+            if bounds != sorted({*bounds} & {*range(MAX_SHARDS + 1)}):
+                raise ValueError(f"the shards of {layer} are not runs of numbers in order")
+        if sum(last - first for each in self.promised.values() for first, last in each) > 10 * MAX_SHARDS:
+            raise ValueError(f"it has more shards than the {10 * MAX_SHARDS:,} that a release may have")
+        return self
+
     def shards(self, layer: str) -> frozenset[int]:
         """Numbers of the shards of a layer that were to be copied."""
         return frozenset(number for run in self.promised.get(layer, ()) for number in range(*run))

@@ -334,10 +334,13 @@ def finish_copy(store: Store, manifest_text: bytes, source: str, shards: Iterabl
       source: where it was copied from, without passwords.
       shards: that were to be copied; those promised before stay so. If all are here, it is a copy no more.
     """
-    old = Release.read_copy(store)
-    promised = {name: set(old.shards(name)) for name in old.promised} if old else {}
-    store.replace(COPY, canonical_json(_copy(sha256_bytes(manifest_text), source, _by_layer(shards, promised))))
-    store.replace(MANIFEST, manifest_text)
+    old, before = Release.read_copy(store), store.find(MANIFEST, MANIFEST_BYTES)
+    if old or before != manifest_text:  # else it is whole, and stays so
+        if before is not None and before != manifest_text:
+            put(store, f"{MANIFESTS}{sha256_bytes(before)}.json", before)
+        promised = {name: set(old.shards(name)) for name in old.promised} if old else {}
+        store.replace(COPY, canonical_json(_copy(sha256_bytes(manifest_text), source, _by_layer(shards, promised))))
+        store.replace(MANIFEST, manifest_text)
     release = Release.open(store)
     write_plain_metadata(release)
     listed = [layer for layer in release.manifest.layers if isinstance(layer, ListedLayer)]

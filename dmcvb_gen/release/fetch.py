@@ -1,7 +1,7 @@
 """Download a release, or the shards of it that hold some episodes; another call resumes or adds.
 
-Inputs and recipes come first, then each shard with its record last, the lists, the manifest. A record that is here says
-that the files of its shard are, so nothing is read twice. A part of a release is a copy: copy.json says of what.
+Inputs and recipes come first, then each shard with its record last, the lists, the manifest. Of a shard that is here,
+sizes alone are compared, so nothing is read twice. A part of a release is a copy: copy.json says of what.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.dataset.gate import Release, Shard
-from dmcvb_gen.dataset.manifest import FileRecord
+from dmcvb_gen.dataset.gate import Release, Shard, recorded_shards
+from dmcvb_gen.dataset.manifest import FileRecord, ListedLayer, list_path
 from dmcvb_gen.dataset.writer import finish_copy, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
 from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
 from dmcvb_gen.options import Count, Local, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
-from dmcvb_gen.release.tree import attachments, described_files, list_files, manifest_text, release_at
+from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at, manifest_text
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path, shown
 from dmcvb_gen.storage.store import Store, open_store
@@ -45,6 +45,7 @@ def fetch(
     episode_range: Span | None = None,
     *,
     paint: bool = False,
+    repair: bool = False,
     storage_options: dict[str, Any] | None = None,
     workers: Count = 8,
     progress: bool = True,
@@ -57,6 +58,7 @@ def fetch(
       only (PATTERN): Fetch only these subsets.
       episode_range (RANGE): Use only the shards with episodes A to B - 1.
       paint: Then render the images, as `paint` does.
+      repair: Compare the files that are here by their digests, and replace those that differ.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
       workers: Parallel transfers.
 
@@ -72,8 +74,9 @@ def download(given: Mapping[str, Any], notify: Callable[[str], None] = ignore) -
     """Do what the arguments of `fetch` ask for: what was moved and, with `paint`, what was rendered."""
     only, episodes = as_names(given["only"]), given["episode_range"]
     with progress_bar(given["progress"], "B") as bar:
-        out, source = local_path(given["out"]), Release.open(given["url"], given["storage_options"])
-        moved = _fetch(source, given["url"], out, only, episodes, given["workers"], bar)
+        source = Release.open(given["url"], given["storage_options"], own_images=False)
+        download = _Download(source, local_path(given["out"]), given["repair"], given["workers"], bar)
+        moved = _fetch(source, given["url"], download, only, episodes)
     if not given["paint"]:
         return moved, None
     from dmcvb_gen.making import paint  # here, as it needs a simulator
@@ -83,57 +86,59 @@ def download(given: Mapping[str, Any], notify: Callable[[str], None] = ignore) -
 
 
 def _fetch(
-    source: Release,
-    url: str,
-    folder: Path,
-    only: Sequence[str],
-    episodes: tuple[int, int] | None,
-    workers: int,
-    tick: ProgressCallback,
+    source: Release, url: str, download: "_Download", only: Sequence[str], episodes: tuple[int, int] | None
 ) -> Moved:
+    target, names = download.target, source.select(only)
     if source.in_the_making:
         raise StoreError(f"{source.place} is not finished; finish it first: dmcvb-gen rollout --out {source.place}")
-    if source.store.folder and source.store.folder.resolve() == folder.resolve():
-        raise StoreError(
-            f"{folder} is the release itself; choose another --out, or render its images: "
-            f"dmcvb-gen paint {quoted(folder)}"
-        )
-    target, names = open_store(folder), source.select(only)
-    there = release_at(target, source)
+    check_apart(source, target, f"choose another --out, or render its images: dmcvb-gen paint {quoted(source.place)}")
+    there, text = manifest_at(target, source), manifest_text(source)
     shards = [shard for shard in source.shards(names, episodes) if shard.here]
     if not shards:
         raise StoreError(f"{source.place} has none of these episodes; it has others, see `dmcvb-gen info`")
-    layers = {name: None for record in source.manifest.subsets if record.name in names for name in record.layers}
-    download = _Download(source, target, folder, workers, tick)
-    first, last = described_files(source, names), list_files(source, layers)
+    layers = {name for record in source.manifest.subsets if record.name in names for name in record.layers}
+    kept = _kept(source, target)
+    first, last = described_files(source, names), list_files(source, layers | {shard.layer.name for shard in kept})
     files = [*first, *(file for shard in shards for file in (*shard.files, shard.record_file)), *last]
-    download.check_room(files)
-    expect(tick, sum(file.bytes for file in files))
-    text = manifest_text(source)
+    download.begin(files)
     download.bring(first)
     download.bring_shards(shards)
     download.bring(last)
-    grown = there is not None and there.digest != source.digest
-    for path, data in attachments(source.store).items():
-        if grown or target.size(path) is None:
+    for path, data in attachments(source.store):
+        if download.repair or there not in (None, text) or target.size(path) is None:
             target.replace(path, data)
-    finish_copy(target, text, shown(url), shards)
+    finish_copy(target, text, shown(url), [*shards, *kept])
     return Moved(len(files), sum(file.bytes for file in files), download.moved)
+
+
+def _kept(source: Release, target: Store) -> list[Shard]:
+    """The shards of a release that a folder has already; after a growth they are read by the lists of the new one."""
+    found: list[Shard] = []
+    for layer in source.manifest.layers:
+        if numbers := recorded_shards(target, layer.name):
+            shards = source.layer_shards(layer.name)
+            if not shards and isinstance(layer, ListedLayer) and target.size(list_path(layer.list)) is None:
+                source.records(layer.name)  # says what the source lacks
+            found += [shard for shard in shards if shard.number in numbers]
+    return found
 
 
 class _Download:
     """Files of a release on their way to a folder.
 
     Attributes:
+      target: the folder's files.
+      repair: whether files that are here are compared by their digests.
       moved: how many files came.
     """
 
-    def __init__(self, source: Release, target: Store, folder: Path, workers: int, tick: ProgressCallback):
-        self._source, self._target, self._workers, self._tick = source.store, target, workers, tick
-        self._folder, self.moved = folder, 0
+    def __init__(self, source: Release, folder: Path, repair: bool, workers: int, tick: ProgressCallback):
+        self._source, self._folder, self._workers, self._tick = source.store, folder, workers, tick
+        self.target, self.repair, self.moved = open_store(folder), repair, 0
 
-    def check_room(self, files: Sequence[FileRecord]) -> None:
+    def begin(self, files: Sequence[FileRecord]) -> None:
         """Raises StoreError if the files that are not here do not fit."""
+        expect(self._tick, sum(file.bytes for file in files))
         with storage_errors(self._folder, "write to"):
             free = free_bytes(self._folder)
         needed = sum(file.bytes for file in files if not (self._folder / file.path).exists())
@@ -147,10 +152,11 @@ class _Download:
         """Bring the files of shards, then their records. A record that is here says that the files are."""
         absent = []
         for shard in shards:
-            if self._target.size(shard.record_path) is None:
+            files = (*shard.files, shard.record_file)
+            if self.repair or any(self.target.size(file.path) != file.bytes for file in files):
                 absent.append(shard)
             else:
-                self._tick(sum(file.bytes for file in (*shard.files, shard.record_file)))
+                self._tick(sum(file.bytes for file in files))
         for first in range(0, len(absent), self._workers):
             few = absent[first : first + self._workers]
             self.bring([file for shard in few for file in shard.files])
@@ -162,10 +168,10 @@ class _Download:
             self.moved += sum(pool.map(self._bring_one, files))
 
     def _bring_one(self, file: FileRecord) -> bool:
-        wrong = wrong_bytes(self._target, file)
+        wrong = wrong_bytes(self.target, file)
         if wrong:
             if wrong != "is missing":
-                self._target.delete(file.path)
+                self.target.delete(file.path)
             self._source.download(file.path, self._folder / file.path, file.bytes, file.sha256)
         self._tick(file.bytes)
         return wrong is not None

@@ -12,11 +12,12 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json
 from dmcvb_gen.dataset.writer import copy_of, plain_metadata, wrong_bytes
 from dmcvb_gen.errors import StoreError
+from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.options import Count, Location, checked, progress_bar, refuse
 from dmcvb_gen.parallel import ProgressCallback, expect
 from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
-from dmcvb_gen.release.tree import attachments, described_files, list_files, manifest_text, release_at
+from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at, manifest_text
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import quoted
 
@@ -40,11 +41,11 @@ def publish(
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
       repair: Compare published files by their digests, and replace those that differ.
       workers: Parallel transfers.
-      pixels: False: Publish without images; `paint` renders them again.
+      pixels: False: Publish without images; `paint` renders them again. Images that are there stay.
 
     Raises:
-      StoreError: the release is not complete or damaged; another version is there; access is refused; a file could not
-        be moved.
+      StoreError: the release is not complete or damaged; the URL is its own folder; another version is there; access is
+        refused; a file could not be moved.
     """
     with progress_bar(progress, " files", scaled=False) as bar:
         if not (Path(release) / MANIFEST).exists() and export_format(release) is not None:
@@ -56,17 +57,19 @@ def publish(
 def _publish_release(
     root: str | Path, store: Store, pixels: bool, repair: bool, workers: int, tick: ProgressCallback
 ) -> Moved:
-    release = Release.open(root)
+    release = Release.open(root, own_images=False)
     _check_complete(release, root, pixels)
-    shards = list(release.shards(images=pixels))
-    light = copy_of(release, shards)
-    texts = attachments(release.store)
+    check_apart(release, store, "choose another URL")
+    text, texts = manifest_text(release), dict(attachments(release.store))
     store.begin()
     tag = store.version(MANIFEST)
-    there = release_at(store, release)
-    same = there is not None and there.digest == release.digest
-    if there is not None and not same:
-        texts[f"{MANIFESTS}{there.digest}.json"] = manifest_text(there)  # what it replaces can still be cited
+    there = manifest_at(store, release)
+    if there is not None and there != text:
+        texts[f"{MANIFESTS}{sha256_bytes(there)}.json"] = there  # what it replaces can still be cited
+    upload = _Upload(release, store, repair, workers, tick)
+    chosen = {shard.record_path for shard in release.shards(images=pixels)} | upload.sizes.keys()
+    shards = [shard for shard in release.shards() if shard.record_path in chosen]
+    light = copy_of(release, shards)
     names = [record.name for record in release.manifest.subsets]
     parts: list[Sequence[FileRecord]] = [
         [*described_files(release, names), *(file for shard in shards for file in shard.files)],
@@ -75,7 +78,6 @@ def _publish_release(
     ]
     files = [file for part in parts for file in part]
     expect(tick, len(files))
-    upload = _Upload(release, store, repair, workers, tick)
     for part in parts:
         upload.put(part)
     if light.copy:
@@ -83,10 +85,10 @@ def _publish_release(
     elif store.size(COPY) is not None:
         store.delete(COPY)  # of images that were left out before
     plain = plain_metadata(light)
-    if not same or upload.moved or _differ(store, texts):
+    if there != text or upload.moved or _differ(store, texts):
         if not store.writable:  # one commit
             texts |= plain
-        if not store.finish(texts | {MANIFEST: manifest_text(release)}, expected=tag):
+        if not store.finish(texts | {MANIFEST: text}, expected=tag):
             raise StoreError(f"{store.place} was published to by another process meanwhile; run the command again")
     if store.writable:
         with ThreadPoolExecutor(max(1, workers)) as pool:
@@ -116,12 +118,13 @@ class _Upload:
     """Files of a release on their way to a place.
 
     Attributes:
+      sizes: path -> bytes of what is there already.
       moved: how many files were sent.
     """
 
     def __init__(self, release: Release, store: Store, repair: bool, workers: int, tick: ProgressCallback):
         self._release, self._store, self._repair, self._workers, self._tick = release, store, repair, workers, tick
-        self._sizes = store.list()
+        self.sizes = store.list()
         self.moved = 0
 
     def put(self, files: Sequence[FileRecord]) -> None:
@@ -131,16 +134,16 @@ class _Upload:
           StoreError: a file here is damaged, or one there has other bytes.
         """
         known = self._each(self._store, files) if self._repair else {}
-        todo = [file for file in files if known.get(file.path) or self._sizes.get(file.path) != file.bytes]
+        todo = [file for file in files if known.get(file.path) or self.sizes.get(file.path) != file.bytes]
         self._tick(len(files) - len(todo))
         for path, wrong in self._each(self._release.store, todo).items():
             if wrong:
                 cure = f"`dmcvb-gen regenerate {quoted(self._release.place)}` repairs it"
                 raise StoreError(f"{self._release.place}/{path} {wrong}; {cure}")
-        there = [file for file in todo if file.path in self._sizes]
+        there = [file for file in todo if file.path in self.sizes]
         if there and not self._repair:
             raise StoreError(
-                f"{self._store.place}/{there[0].path} has {self._sizes[there[0].path]} bytes instead of "
+                f"{self._store.place}/{there[0].path} has {self.sizes[there[0].path]} bytes instead of "
                 f"{there[0].bytes}; replace what is damaged with --repair"
             )
         for file in there:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import (
@@ -29,12 +28,12 @@ from dmcvb_gen.dataset.manifest import (
 from dmcvb_gen.dataset.writer import PROVENANCE_BYTES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
-from dmcvb_gen.storage.store import NotThere, Store
+from dmcvb_gen.storage.store import Store
 
 ATTACHMENTS = (*ATTACHMENT_FILES, f"{CARD_FOLDER}contact_sheet.png", f"{CARD_FOLDER}episodes.parquet")
 """Files that are copied with a release as they are; no digest covers them."""
-ATTACHMENT_BYTES, NOTES = 2**30, 100
-"""The largest of them, and the number of notes of provenance that go with a release."""
+TABLE_BYTES, ATTACHMENT_BYTES, NOTES = 2**30, 2**26, 100
+"""The largest table of episodes, the largest of the others, and the number of notes of provenance that go along."""
 
 
 def described_files(release: Release, names: Collection[str]) -> tuple[FileRecord, ...]:
@@ -64,23 +63,22 @@ def manifest_text(release: Release) -> bytes:
     Raises:
       StoreError: it was replaced since the release was opened.
     """
-    text = release.store.read(MANIFEST, MANIFEST_BYTES)
+    text = release.store.read(release.manifest_path, MANIFEST_BYTES)
     if sha256_bytes(text) != release.digest:
         raise StoreError(f"{release.place} was changed meanwhile; run the command again")
     return text
 
 
-def attachments(store: Store) -> dict[str, bytes]:
-    """Path -> bytes of the attachments that are there, and of the notes of who made the release."""
-    found = {}
+def attachments(store: Store) -> Iterator[tuple[str, bytes]]:
+    """Paths and bytes of the attachments that are there, and of the notes of who made the release."""
     try:
         notes = [path for path, size in store.list(PROVENANCE).items() if size <= PROVENANCE_BYTES][:NOTES]
     except StoreError:  # a web server gives no lists
         notes = []
     for path in (*ATTACHMENTS, *notes):
-        with contextlib.suppress(NotThere):
-            found[path] = store.read(path, ATTACHMENT_BYTES)
-    return found
+        data = store.find(path, TABLE_BYTES if path.endswith(".parquet") else ATTACHMENT_BYTES)
+        if data is not None:
+            yield path, data
 
 
 def grows_from(new: Release, old: Release) -> bool:
@@ -104,8 +102,8 @@ def folders_of(release: Release) -> tuple[str, ...]:
     return (RECORDS, LAYERS, MANIFESTS, PROVENANCE, *(f"{layer.group}/" for layer in release.layers.values()))
 
 
-def release_at(store: Store, release: Release) -> Release | None:
-    """Return the release at a destination: the same one, or an older one that it has grown from.
+def manifest_at(store: Store, release: Release) -> bytes | None:
+    """Return the manifest at a destination: of this release, or of an older one that it has grown from.
 
     Returns:
       None if nothing is there, or what an interrupted try has left.
@@ -113,13 +111,13 @@ def release_at(store: Store, release: Release) -> Release | None:
     Raises:
       StoreError: something else is there.
     """
-    copy = Release.read_copy(store)
+    text, copy = store.find(MANIFEST, MANIFEST_BYTES), Release.read_copy(store)
     if copy is not None and copy.manifest == release.digest:
-        return release
-    if store.size(MANIFEST) is not None:
-        there = Release.open(store)
+        return text  # an interrupted try may have left the older one
+    if text is not None:
+        there = Release.open(store, own_images=False)
         if there.digest == release.digest or grows_from(release, there):
-            return there
+            return text
         raise StoreError(
             f"{store.place} already holds {_named(there)} and not {_named(release)}, and a release never changes; "
             "choose another place (a changed byte is a new version)"
@@ -134,6 +132,13 @@ def release_at(store: Store, release: Release) -> Release | None:
         more = f" and {len(others) - 1} more" if others[1:] else ""
         raise StoreError(f"{store.place} holds {others[0]}{more}, and not this release; choose an empty destination")
     return None
+
+
+def check_apart(release: Release, target: Store, cure: str) -> None:
+    """Raises StoreError if a destination is the folder of a release, or lies in it."""
+    source, folder = release.store.folder, target.folder
+    if source and folder and folder.resolve().is_relative_to(source.resolve()):
+        raise StoreError(f"{folder} is the release itself, or in its folder; {cure}")
 
 
 def _named(release: Release) -> str:

@@ -197,7 +197,8 @@ def _expected(release: Release) -> tuple[list[Listed], list[Issue]]:
     except StoreError as error:
         findings.append(Issue("files", RECIPES, str(error)))
     if not release.in_the_making and not findings:
-        plain = (file_of(path, text) for path, text in plain_metadata(release).items())
+        texts = plain_metadata(release) if release.manifest_path == MANIFEST else {}  # which is of the newest alone
+        plain = (file_of(path, text) for path, text in texts.items())
         files += [(file.path, file) for file in (*list_files(release, used), *plain)]
     return files, findings
 
@@ -232,7 +233,7 @@ def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
     """Files that belong to no release."""
     known = {file.path for _, file in files} | {MANIFEST, COPY}
     folders = (RECIPES, PREVIEWS, *folders_of(release))
-    for path in release.store.list():
+    for path in release.store.list() if release.manifest_path == MANIFEST else ():
         if path not in known and not path.startswith(folders) and not is_attachment(path):
             yield Issue("files", path, f"{NOT_PART}; move it elsewhere")
 

@@ -34,6 +34,10 @@ _SECRETS = (
 """What of a message is struck out, and what stands for it."""
 
 
+class Refused(StoreError):
+    """Who asks may not read or write there."""
+
+
 @contextlib.contextmanager
 def storage_errors(place: str | Path, doing: str = "read", decoding: bool = False) -> Iterator[None]:
     """Turn what storage raises inside into one line with a cure; other exceptions pass.
@@ -55,7 +59,8 @@ def storage_errors(place: str | Path, doing: str = "read", decoding: bool = Fals
         package = type(error).__module__.split(".")[0]
         if not (decoding or package in CLIENTS | DECODERS or isinstance(error, OSError | ImportError)):
             raise
-        raise StoreError(_explained(error, str(place), doing, package in CLIENTS)) from None
+        kind = Refused if isinstance(error, PermissionError) else StoreError
+        raise kind(_explained(error, str(place), doing, package in CLIENTS)) from None
 
 
 def reason(error: BaseException) -> str:

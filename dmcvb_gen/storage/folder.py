@@ -107,7 +107,7 @@ class LocalStore(Store):
         return True
 
     def _lock(self) -> FileLock:
-        return FileLock(self.folder / LOCK)
+        return FileLock(self._at(LOCK))
 
     def _delete(self, path: str) -> None:
         self._at(path).unlink()

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Final
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import LASTING, creating, replacing
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.storage.errors import storage_errors
+from dmcvb_gen.storage.errors import Refused, storage_errors
 
 PIECE = 16 * 2**20
 """Bytes that are in memory at once while a file passes."""
@@ -122,6 +122,20 @@ class Store(abc.ABC):
           NotThere: there is no such file. StoreError: it is larger, it is no regular file, or see the class.
         """
         return b"".join(self._bounded(path, limit))
+
+    def find(self, path: str, limit: int) -> bytes | None:
+        """The bytes of a file that a place may lack, see `read`; None if it does.
+
+        A server that may not list its files (S3) refuses what is not there: ask where another file could be read.
+        """
+        try:
+            return self.read(path, limit)
+        except NotThere:
+            return None
+        except Refused:
+            if self.folder is not None:
+                raise
+            return None
 
     def read_range(self, path: str, start: int, length: int) -> bytes:
         """Exactly `length` bytes of a file, from byte `start` on.

@@ -43,7 +43,8 @@ class ZarrFiles(Store):
         if len(data) == file.bytes and hashlib.sha256(data).hexdigest() != file.sha256:
             _quiet()
             raise StoreError(
-                f"{self.store.place}/{path} is damaged: it does not have its SHA-256; regenerate or fetch it"
+                f"{self.store.place}/{path} is damaged: it does not have its SHA-256; regenerate it, or fetch it with "
+                "--repair"
             )
         return prototype.buffer.from_bytes(data)
 

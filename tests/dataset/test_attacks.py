@@ -15,7 +15,7 @@ import pytest
 from numcodecs.zstd import Zstd
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import MAX_LIST_BYTES, MAX_SHARDS, canonical_json, list_bytes_limit
+from dmcvb_gen.dataset.manifest import MAX_LIST_BYTES, MAX_SHARDS, Copy, canonical_json, list_bytes_limit
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import open_store
@@ -103,6 +103,9 @@ ATTACKS: dict[str, Callable[[Path], None]] = {
     ),
     "a layer that is not described": _rewrite_manifest(lambda m: m["subsets"][0]["layers"].append("hop/none")),
     "another list": _rewrite_manifest(lambda m: m["layers"][0].update(list="0" * 64)),
+    "a copy of shards without end": lambda root: (root / "copy.json").write_bytes(
+        canonical_json(Copy(manifest="0" * 64)).replace(b"{}", b'{"hop/none": [[0, 1000000000000000]]}')
+    ),
     "deep JSON": lambda root: _manifest_file(root).write_bytes(b"[" * 10**6),
     "a manifest of 64 GB": _replaced(_sparse, _manifest_file),
     "a manifest that is a pipe": _replaced(os.mkfifo, _manifest_file),

@@ -41,6 +41,10 @@ def _publish(root: Path) -> None:
     publish(root.parent / SOURCE, f"file:{root}", workers=1)
 
 
+def _publish_light(root: Path) -> None:
+    publish(root.parent / SOURCE, f"file:{root}", workers=1, pixels=False)
+
+
 TABLE: dict[str, tuple[list[Callable], Callable]] = {
     "rollout": ([], _rollout),
     "paint": ([_light], _rollout),
@@ -48,6 +52,9 @@ TABLE: dict[str, tuple[list[Callable], Callable]] = {
     "fetch": ([], _fetch),
     "publish": ([], _publish),
     "publish of what grew": ([_rollout], _publish),
+    "light publish": ([], _publish_light),
+    "light publish of what grew": ([_rollout], _publish_light),
+    "fetch of what grew": ([_rollout], _fetch),
 }
 """Name -> commands that ran before, and the command that is killed."""
 CASES = [pytest.param(name, marks=pytest.mark.slow if name == "fetch" else pytest.mark.full) for name in TABLE]
@@ -100,7 +107,9 @@ def _digest(root: Path) -> str | None:
 
 def _seen(root: Path, name: str) -> str | None:
     """Check what lies in the folder and what a reader sees; the digest of it."""
-    if name != "fetch":
+    if name.startswith(("fetch", "light")):
+        assert not any(root.rglob("zarr.json")) or (root / "manifest.json").exists()
+    else:
         oracle.check(root)
     if not any(root.glob("recipes/*.json")) and not (root / "manifest.json").exists():
         return None

@@ -9,7 +9,7 @@ import pytest
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import COPY, MANIFEST
-from dmcvb_gen.dataset.writer import finish
+from dmcvb_gen.dataset.writer import begin, finish, put_shard
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.release import fetch as fetching
@@ -18,9 +18,9 @@ from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.storage.store import open_store
 from tests.conftest import wrong_files
-from tests.dataset.made_up import make, recipe
+from tests.dataset.made_up import make, recipe, values
 from tests.fake_hub import fake_hub
-from tests.web_server import serving_s3
+from tests.web_server import give_files, serving, serving_s3
 
 
 def content(place, storage_options=None):
@@ -110,13 +110,53 @@ def test_a_grown_release_takes_the_place_of_the_older(made, place, tmp_path):
     old = Release.open(made).digest
     make(open_store(made), recipe(5))
     publish(made, url, **options)
-    fetch(url, back, **options)
-    assert Release.open(back)["hop/random/none"].record.episodes == 5 and not wrong_files(back)
+    fetch(url, back, ["*/none"], **options)
+    assert len(Release.open(back)["hop/random/none"]) == 5 and not wrong_files(back)
+    assert len(Release.open(back)["hop/random/dynamic"].read("pixels")) == 3  # those that came before
     assert sha256_bytes(content(url, **options)[f"manifests/{old}.json"]) == old
+    for replaced in (Release.open(url, *options.values(), digest=old), Release.open(back, digest=old)):
+        assert replaced.compared and len(replaced["hop/random/none"].read("state")) == 3
+    assert verify(f"{url}@sha256:{old}", everything=True, **options).sound
     with pytest.raises(StoreError, match="already holds hop 1.0.0"):
         publish(tmp_path / "old", url, **options)
     with pytest.raises(StoreError, match="and not hop 1.0.0"):
         fetch(f"file:{tmp_path / 'old'}", back)
+
+
+def test_a_publish_without_images_goes_on_and_leaves_images_that_are_there(made, tmp_path):
+    light, whole = tmp_path / "light", tmp_path / "whole"
+    publish(made, f"file:{light}", pixels=False)
+    (light / MANIFEST).unlink()
+    publish(made, f"file:{light}", pixels=False)
+    assert Release.open(light).digest == Release.open(made).digest and not wrong_files(light)
+    publish(made, f"file:{whole}")
+    publish(made, f"file:{whole}", pixels=False)
+    assert content(whole) == content(made)
+    for place in (made, made / "below"):
+        with pytest.raises(StoreError, match="is the release itself, or in its folder; choose another URL"):
+            publish(made, f"file:{place}", pixels=False)
+
+
+def test_images_that_no_manifest_names_are_not_copied(tmp_path):
+    made, there, back = (tmp_path / name for name in ("made", "there", "back"))
+    make(open_store(made), recipe(5, images=False))
+    before, layer = content(made), recipe(5).layers[2]
+    begin(open_store(made), recipe(5), {})
+    put_shard(open_store(made), layer, 0, values(layer, 0))
+    finish(open_store(made))
+    publish(made, f"file:{there}")
+    fetch(f"file:{made}", back)
+    assert content(there) == content(back) == before
+
+
+def test_a_server_that_refuses_what_is_not_there_is_read(made, tmp_path):
+    def answer(request):
+        known = (made / request.path.lstrip("/")).is_file()
+        return give_files(lambda path: made / path)(request) if known else request.give(b"", 403)
+
+    with serving(answer) as server:
+        fetch(server.url, tmp_path / "back")
+    assert content(tmp_path / "back") == content(made)
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "README.md"])
@@ -184,6 +224,20 @@ def test_what_was_damaged_or_lost_there_is_found_and_replaced(made, tmp_path, mo
         publish(made, url)
     assert publish(made, url, repair=True).moved == 3 and content(there) == before
     assert verify(url, everything=True).sound
+
+
+def test_a_fetch_finds_another_size_and_with_repair_another_digest(made, tmp_path):
+    back, before = tmp_path / "back", content(made)
+    fetch(f"file:{made}", back)
+    wrong, short = (f"hop/random.zarr/none/pixels/c/{number}/0/0/0/0" for number in range(2))
+    lost = "records/hop/random/none/labels/00000.json"
+    (back / wrong).write_bytes(before[wrong][:-1] + b"x")
+    (back / short).write_bytes(b"half")
+    (back / lost).unlink()
+    fetch(f"file:{made}", back)
+    assert {path for path, data in content(back).items() if data != before[path]} == {wrong}
+    fetch(f"file:{made}", back, repair=True)
+    assert content(back) == before
 
 
 def test_no_room_is_said_before_anything_comes(made, tmp_path, monkeypatch):
