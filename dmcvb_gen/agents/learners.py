@@ -120,6 +120,8 @@ class Learner(nn.Module, abc.ABC):
         """One gradient step; the losses before it."""
         with self.precision():
             losses = self.losses(batch)
+        if "loss" not in losses:
+            raise DmcvbError(f"{type(self).__name__}.losses gives {list(losses)}; call the one to minimize 'loss'")
         self._descend("main", losses["loss"])
         return {name: value.detach() for name, value in losses.items()}
 

@@ -12,6 +12,8 @@ import torch
 from dm_control import suite
 
 import dmcvb_gen
+from dmcvb_gen.agents import trainer
+from dmcvb_gen.agents.learners import Learner
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
 
@@ -76,6 +78,19 @@ def test_actions_lie_in_a_tasks_own_bounds():
         dmcvb_gen.evaluate(lambda _, action=action: np.stack([action] * 2), "quadruped-walk/none", **options)
     with pytest.raises(DmcvbError, match=r"is 1.01; expected \[-1, 1\], clip it"):
         dmcvb_gen.evaluate(lambda _: np.stack([spec.maximum + 0.01] * 2), "quadruped-walk/none", **options)
+
+
+def test_losses_that_cannot_be_minimized_are_told_of_the_agent():
+    class Own(Learner):
+        def losses(self, batch):
+            return {"error": self.weight.sum()}
+
+    own = Own()
+    own.weight = torch.nn.Parameter(torch.ones(1))
+    with pytest.raises(DmcvbError, match="^Own.losses gives .'error'.; call the one to minimize 'loss'"):
+        own.update(None)
+    with pytest.raises(DmcvbError, match="no longer finite at step 1; look at the agent's losses, and at the data"):
+        trainer._means({"loss": [torch.tensor(np.nan)]}, 1)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
