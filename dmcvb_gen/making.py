@@ -82,13 +82,13 @@ def rollout(
       goals: Mazes: visible, hidden, fixed, or fixed3 for 3 fixed pairs of start and goal. [default: visible]
       episodes: Episodes per subset; fixed goals share them. [default: 20]
       steps: Steps per subset, instead of --episodes.
-      max_steps: Longest episode, in steps. [default: 500, mazes 600, at action repeat 2]
+      max_steps: Longest episode, in steps, at most 5000. [default: 500, mazes 600, at action repeat 2]
       action_repeat: Control steps for which an action is held. [default: 2]
       episode_range (RANGE): Generate only the shards with episodes A to B - 1.
       seed: Random seed of the release. [default: 0]
-      size: Width and height of the images, in pixels. [default: 64]
+      size: Width and height of the images, 8 to 1024 pixels. [default: 64]
       renderer: native or opengl. [default: native]
-      samples: Samples per pixel: 1, 2, 4 or 8; native has 4. [default: 4]
+      samples: Samples per pixel; native has 4. [default: 4]
       backgrounds: Background videos: builtin, or a folder. [default: builtin]
       split: Background videos and maze styles: train or val. [default: train]
       behaviour (BEHAVIOUR): Policy instead of the bundled one: a policy file, a training run, an SB3
@@ -215,7 +215,7 @@ def paint(
       release: Folder of the release.
       only (PATTERN): Render only these subsets.
       episode_range (RANGE): Use only the shards with episodes A to B - 1.
-      size: Width and height in pixels. [default: the manifest's]
+      size: Width and height, 8 to 1024 pixels. [default: the manifest's]
       views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
       goal: Mazes: render only images with, or without, the goal. [default: both]
       workers: Worker processes. [default: a core each, as far as memory allows]
@@ -260,9 +260,9 @@ def repaint(
       release (RELEASE): Folder of the release.
       only (PATTERN): Render only these subsets.
       distractor: none, static, dynamic, or at a strength: dynamic_hard, dynamic_0.35. [default: the subset's own]
-      size: Width and height in pixels. [default: the subset's own]
+      size: Width and height, 8 to 1024 pixels. [default: the subset's own]
       renderer: native or opengl. [default: the subset's own]
-      samples: Samples per pixel: 1, 2, 4 or 8.
+      samples: Samples per pixel.
       backgrounds (FOLDER): Background videos: builtin, or a folder. [default: the recipe's]
       split: Background videos and maze styles. [default: the recipe's]
       labels: Also store a modality: depth, segmentation, parts, flow (optical flow to the next frame) or your own.

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar
 
-from annotated_types import Ge, Le
+from annotated_types import Ge
 
 from dmcvb_gen.errors import DmcvbError
 
@@ -28,7 +28,10 @@ SEVERAL = "several"
 RANGE = "range"
 """Mark of (A, B) with 0 <= A < B."""
 
-Location = str | Path
+PLACE = "place"
+"""Mark of text that may not be empty, as that of an unset variable of a shell is."""
+
+Location = Annotated[str | Path, PLACE]
 """A folder, a file or a URL."""
 Local = Location
 """A folder or file to write to, which functions refuse if it is a URL (`storage.places.local_path`)."""
@@ -36,7 +39,7 @@ Names = Annotated[tuple[Location, ...], SEVERAL]
 """One name or several."""
 Count = Annotated[int, Ge(1)]
 Seed = Annotated[int, Ge(0)]
-Samples = Annotated[int, Ge(1), Le(8)]
+Samples = Literal[1, 2, 4, 8]
 Span = Annotated[tuple[int, int], RANGE]
 """(first, last + 1)."""
 GoalPictures = Literal["visible", "hidden"]
@@ -110,6 +113,8 @@ def _checked(name: str, value: Any, annotation: Any) -> Any:
     except pydantic.ValidationError as error:
         reason = error.errors()[0]["msg"]
         raise DmcvbError(f"{name} is {value!r}: {reason[0].lower()}{reason[1:]}") from None
+    if PLACE in marks and taken == "":
+        raise DmcvbError(f"{name} is empty; give a place, or leave it out")
     if RANGE in marks and taken is not None and not 0 <= taken[0] < taken[1]:
         raise DmcvbError(f"{name} is {value!r}: give (A, B) with 0 <= A < B")
     return taken

@@ -23,7 +23,7 @@ from typing import Any, Literal
 import click
 
 from dmcvb_gen.cli.common import GroupedCommand, json_option, parse_options
-from dmcvb_gen.options import parts_of
+from dmcvb_gen.options import PLACE, parts_of
 from dmcvb_gen.parallel import Ray, Workers
 
 METAVARS = {"RANGE": "A:B", "BEHAVIOUR": "FILE|RUN|MODULE:FUNCTION"}
@@ -117,6 +117,8 @@ def _click_type(kinds: Sequence[Any], marks: Sequence[Any]) -> Any:
         return click.Choice(typing.get_args(kinds[0]))
     if Ray in kinds:
         return WorkersType(min=1)
+    if PLACE in marks:
+        return PlaceType()
     if not {int, float} & {*kinds}:
         return str
     sides = {"ge": ("min", False), "gt": ("min", True), "le": ("max", False), "lt": ("max", True)}
@@ -134,7 +136,21 @@ class WorkersType(click.IntRange):
     """A number of processes, or "ray": the cluster that RAY_ADDRESS names, else one on this machine."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Workers:
-        return Ray() if value == "ray" else super().convert(value, param, ctx)
+        try:
+            return Ray() if value == "ray" else super().convert(value, param, ctx)
+        except click.BadParameter:
+            raise click.UsageError(f"--workers is {value!r}; give a number of processes, 1 or more, or ray") from None
+
+
+class PlaceType(click.ParamType):
+    """A folder, file or URL; not the empty text of an unset variable."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        if value == "":
+            raise click.UsageError(f"{param.get_error_hint(ctx)} is empty; give a place, or leave it out")
+        return value
 
 
 def _repeatable(text: str) -> str:

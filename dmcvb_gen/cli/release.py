@@ -50,6 +50,8 @@ def _verified(path, result):
     if absent := len(result.incomplete) - len(named):
         yield f"{absent:,} of {pluralize(len(result.incomplete), 'incomplete subsets')} have no local episodes."
     checked = ", ".join(pluralize(count, name) for name, count in result.checked.items())
+    if result.checked["files"] < result.covered:
+        checked += f" of {result.covered:,}"
     verdict = "All checks passed" if result.sound else pluralize(len(result.findings), "findings")
     if result.incomplete:
         here = result.checked["episodes"]

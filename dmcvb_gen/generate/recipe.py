@@ -44,6 +44,8 @@ DEFAULT_EPISODES_PER_SHARD = {LOCOMOTION: 50, ANT_MAZE: 10}
 """Episodes a shard: what a worker holds in memory and what a crash can cost."""
 NATIVE = "native"
 """The renderer of the package itself, which draws the same bits everywhere."""
+COMMAND_LINE = "command line"
+"""Where a recipe comes from that options alone describe."""
 MAX_STEPS = 5000
 """Longest episode that a recipe may ask for; a shard is held in memory."""
 
@@ -285,7 +287,7 @@ def override(recipe: Recipe, **changes: Any) -> Recipe:
         each["policies"] = {_one_level(recipe): changes["behaviour"]}
     data = recipe.model_dump(mode="json") | own
     data["subsets"] = [part for pattern in data["subsets"] for part in _overridden(pattern, each)]
-    return make_recipe(data, "command line")
+    return make_recipe(data, COMMAND_LINE)
 
 
 def _overridden(pattern: dict[str, Any], each: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -381,4 +383,6 @@ def make_recipe(data: dict[str, Any], where: str = "recipe") -> Recipe:
         if first["type"] == "extra_forbidden":
             model = Recipe if len(place) == 1 else SubsetPattern if place[0] == "subsets" else RendererChoice
             told = str(UnknownNameError("field", place[-1], model.model_fields))
+        if where == COMMAND_LINE:  # a recipe's fields have the names of the options
+            raise RecipeError(f"--{str(place[-1]).replace('_', '-')} is {first['input']!r}: {told}") from None
         raise RecipeError(f"{where}: {'.'.join(map(str, place)) or 'the top'}: {told}") from None

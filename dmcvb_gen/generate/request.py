@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.errors import RecipeError, UnknownNameError
-from dmcvb_gen.generate.recipe import Recipe, check_options_used, load_recipe, make_recipe, narrow, override
+from dmcvb_gen.generate.recipe import (
+    COMMAND_LINE,
+    Recipe,
+    check_options_used,
+    load_recipe,
+    make_recipe,
+    narrow,
+    override,
+)
 from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
 from dmcvb_gen.spec import (
     FIXED,
@@ -29,7 +37,7 @@ _SAME_NAME = ("episodes", "steps", "max_steps", "action_repeat", "episodes_per_s
 RECIPE_OPTIONS = {*_SAME_NAME, "levels", "distractors", "goals", "sample", "renderer", "samples", "backgrounds"}
 RECIPE_OPTIONS |= {"behaviour", "independent"}
 """Options that say what to make, not where or how."""
-_GOAL = re.compile(rf"{FIXED}(\d+)")
+_GOAL = re.compile(rf"{FIXED}([1-9]\d*)")
 
 
 def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **given: Any) -> Recipe:
@@ -106,8 +114,6 @@ def behaviour_source(given: str | Path | None) -> str | None:
     """
     if given is None:
         return None
-    if not str(given):
-        raise RecipeError("--behaviour is empty; leave it out to use the bundled policies")
     module, _, function = str(given).partition(":")
     if module.endswith(".py"):
         name = f"{Path(module).stem}:{function or 'FUNCTION'}"
@@ -167,4 +173,4 @@ def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[s
     name = "-".join(dict.fromkeys(words))[:80].rstrip("-.")
     pattern: dict[str, Any] = {"tasks": list(tasks), "levels": list(levels)}
     pattern |= {"settings": list(settings) or [VISIBLE if True in mazes else "none"], "episodes": EPISODES}
-    return make_recipe({"name": name, "subsets": [pattern]}, "command line")
+    return make_recipe({"name": name, "subsets": [pattern]}, COMMAND_LINE)

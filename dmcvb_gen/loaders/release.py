@@ -31,7 +31,7 @@ class SubsetReader(Subset):
         return self.episode(int(self._episodes[index]))
 
     def part(self, episodes: Iterable[int]) -> Self:
-        """The same subset with these episodes alone, in this order: indices, or a mask such as `subset.returns > 900`."""
+        """The same subset with these episodes alone, in this order: indices, or a mask (`subset.returns > 900`)."""
         chosen = copy.copy(self)
         for name in ("lengths", "returns"):
             chosen.__dict__.pop(name, None)

@@ -18,7 +18,7 @@ import yaml
 from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest, Resolved
+from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest
 from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.distractors.registry import distractors_of
@@ -92,7 +92,8 @@ def _write_files(
     write_table(release, made / TABLE)
     if keep_table and table_rows(folder / TABLE) == table_rows(made / TABLE):
         shutil.copyfile(folder / TABLE, made / TABLE)
-    facts, limits = describe_release(release.path), _limits(release)
+    facts = describe_release(release.path)
+    limits = _limits(release, facts)
     summary = _summary(release, facts)
     texts = {
         README: card_text(release, facts, summary, limits),
@@ -104,7 +105,7 @@ def _write_files(
     return [*texts, SHEET, TABLE]
 
 
-def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = None) -> Publication:
+def _published(folder: Path, manifest: Manifest, url: str | None = None) -> Publication:
     """Place and day of publication: the given one, else those of the existing card of this version, else today."""
     try:
         known = json.loads((folder / CROISSANT).read_text())
@@ -139,11 +140,16 @@ def check_card(root: str | Path) -> list[str]:
         return findings + [f"{name} does not match the release" for name in differ]
 
 
-def _open(root) -> Release:
+def _open(root: Location) -> Release:
+    """A finished release; of a part, its manifest names the subsets that have episodes here alone."""
     release = Release.open(root)
     if not release.subsets:
         raise StoreError(f"{root} has no episodes yet; run the rollout first")
-    return release
+    if release.in_the_making:
+        raise StoreError(f"{root} is not complete; finish it with the same rollout, without --only")
+    here = tuple(record for record in release.manifest.subsets if record.name in release.subsets)
+    manifest = release.manifest.model_copy(update={"subsets": here})
+    return Release(release.store, manifest, release.digest, release.compared, release.copy)
 
 
 def _sheet(release: Release) -> np.ndarray:
@@ -169,10 +175,14 @@ def _summary(release: Release, facts: dict[str, Any]) -> str:
         f"{pluralize(len(facts['subsets']), 'subsets')}, "
         f"{pluralize(sum(subset['episodes'] for subset in facts['subsets']), 'episodes')}, {facts['steps']:,} steps."
     )
+    if facts["part"]:
+        planned = [*facts["missing"].values(), *(subset["episodes_planned"] for subset in facts["subsets"])]
+        whole = f"{pluralize(len(planned), 'subsets')} and {pluralize(sum(planned), 'episodes')}"
+        text += f" This is a part of {manifest.name} {manifest.version}, which has {whole}."
     return text.strip()
 
 
-def header(manifest: Manifest | Resolved, steps: int) -> str:
+def header(manifest: Manifest, steps: int) -> str:
     """The YAML header that the Hugging Face Hub reads."""
     category = next((name for limit, name in SIZES if steps < limit), "n>10M")
     facts = {
@@ -218,7 +228,7 @@ def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Seq
 HELD = {1: "one control step", 2: "two control steps", 4: "four control steps"}
 
 
-def _held(manifest: Manifest | Resolved) -> str:
+def _held(manifest: Manifest) -> str:
     """The control steps for which an action is held, in words."""
     return " or ".join(HELD[repeat] for repeat in sorted({record.action_repeat for record in manifest.subsets}))
 
@@ -241,7 +251,7 @@ BACKGROUND = "background"
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 
 
-def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, str]]:
+def _distractors(manifest: Manifest) -> list[tuple[str, str]]:
     """Rows (setting, what varies and how much) of the table of distractors; none for mazes alone."""
     settings: dict[str, DistractorSetting] = {}
     for record in manifest.subsets:
@@ -282,7 +292,7 @@ def _making(release: Release) -> list[str]:
     return [*lines, *(f"Derived: {source}." for source in derived_from(release))]
 
 
-def _policies(manifest: Manifest | Resolved) -> list[tuple[str, str, str]]:
+def _policies(manifest: Manifest) -> list[tuple[str, str, str]]:
     """Rows (task, level, policies) of the table of behaviour policies."""
     rows = []
     for record in {(r.task, r.level): r for r in manifest.subsets}.values():
@@ -292,9 +302,9 @@ def _policies(manifest: Manifest | Resolved) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _limits(release: Release) -> list[str]:
+def _limits(release: Release, facts: dict[str, Any]) -> list[str]:
     manifest, limits = release.manifest, []
-    if release.in_the_making or release.shortfalls:
+    if not (facts["complete"] or facts["part"]):
         limits.append("Not complete: only a part of the recipe's shards exists.")
     if any((record.backgrounds or {}).get("source") == "builtin" for record in manifest.subsets):
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")

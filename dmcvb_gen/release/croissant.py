@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import MANIFEST, ZARR_JSON
+from dmcvb_gen.dataset.manifest import MANIFEST, MANIFEST_BYTES, ZARR_JSON
 from dmcvb_gen.dataset.writer import read_provenance
-from dmcvb_gen.files import sha256_file
+from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.release.episode_table import COLUMNS, TABLE
 from dmcvb_gen.release.templates import fill
 from dmcvb_gen.storage.hugging_face import HubStore
@@ -134,9 +134,9 @@ def _files(release: Release, table: Path) -> Iterator[dict[str, Any]]:
     }
     texts |= {TABLE: "A row an episode, with its first frame."}
     for path, text in texts.items():
-        file = table if path == TABLE else release.path / path
+        data = table.read_bytes() if path == TABLE else release.store.read(path, MANIFEST_BYTES)
         kind = "application/x-parquet" if path == TABLE else "application/json"
-        yield dict(path=path, kind=kind, text=text, bytes=file.stat().st_size, sha256=sha256_file(file))
+        yield dict(path=path, kind=kind, text=text, bytes=len(data), sha256=sha256_bytes(data))
 
 
 def _rows(release: Release, facts: dict[str, Any]) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, FileRecord, file_of, is_attachment
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, ZARR_JSON, FileRecord, file_of, is_attachment
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.writer import plain_metadata, wrong_bytes
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
@@ -41,7 +41,8 @@ class Verification:
     """Result of a verification: what was checked, and the issues.
 
     Attributes:
-      checked: number of subsets, episodes, steps and files.
+      checked: number of subsets, episodes, steps and files, of those that the digest covers.
+      covered: files here that the digest covers: inputs, recipes, shards, records and lists.
       findings: faults that were found.
       incomplete: subsets that are sound but not all here -> (episodes here, episodes that belong to them).
       digest: the release's digest; None while it is made.
@@ -55,6 +56,7 @@ class Verification:
     digest: str | None = None
     compared: bool = False
     unchecked: tuple[Issue, ...] = ()
+    covered: int = 0
 
     @property
     def sound(self) -> bool:
@@ -133,7 +135,7 @@ def verify_folder(
         raise DmcvbError(f"{place} has no episodes yet; run the rollout first")
     for found in in_order(_check_subset, [(subset, backgrounds) for subset in chosen], workers, tick):
         findings += found
-    return _verification(release, chosen, findings, len(files), sound)
+    return _verification(release, chosen, findings, (files, files), sound)
 
 
 def _verify_bytes(release: Release, everything: bool, tick: ProgressCallback, workers: int) -> Verification:
@@ -152,7 +154,7 @@ def _verify_bytes(release: Release, everything: bool, tick: ProgressCallback, wo
     if not everything:
         findings += _wrong_sizes(release, [file for file in files if file not in sample])
     sound = _sound(release, findings)
-    return _verification(release, [subset for subset in sound if len(subset)], findings, len(sample), sound)
+    return _verification(release, [subset for subset in sound if len(subset)], findings, (sample, files), sound)
 
 
 def _sound(release: Release, findings: Sequence[Issue]) -> list[Subset]:
@@ -162,9 +164,20 @@ def _sound(release: Release, findings: Sequence[Issue]) -> list[Subset]:
 
 
 def _verification(
-    release: Release, chosen: Sequence[Subset], findings: list[Issue], files: int, sound: Sequence[Subset]
+    release: Release,
+    chosen: Sequence[Subset],
+    findings: list[Issue],
+    files: tuple[Sequence[Listed], Sequence[Listed]],
+    sound: Sequence[Subset],
 ) -> Verification:
-    counts = {"subsets": len(chosen), "episodes": 0, "steps": 0, "files": files}
+    """The result of a verification.
+
+    Args:
+      files: those that were read, and all.
+      sound: subsets whose layers have no finding.
+    """
+    read, covered = (sum(not file.path.endswith(ZARR_JSON) for _, file in some) for some in files)
+    counts = {"subsets": len(chosen), "episodes": 0, "steps": 0, "files": read}
     for subset in chosen:
         counts["episodes"] += len(subset)
         counts["steps"] += subset.steps
@@ -172,7 +185,7 @@ def _verification(
     incomplete = {subset.name: (len(subset), subset.record.episodes) for subset in lacking}
     unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
     faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
-    return Verification(counts, faults, incomplete, release.digest, release.compared, unchecked)
+    return Verification(counts, faults, incomplete, release.digest, release.compared, unchecked, covered)
 
 
 # -- bytes ----------------------------------------------------------------------------------------

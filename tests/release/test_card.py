@@ -160,6 +160,14 @@ def test_the_card_of_a_part_is_compared_by_its_rows(carded, tmp_path):
     part = tmp_path / "part"
     fetch(f"file:{carded}", part, ["*/none"], (0, 1))
     assert "the card matches the data" in invoke("card", part, "--check", code=0).output
+    written = tmp_path / "written"
+    write_card(part, written)
+    text = (written / "README.md").read_text()
+    assert "This is a part of small 1.0.0, which has 3 subsets and 9 episodes." in text
+    distractors = text.split("## Distractors")[1].split("## Load it")[0]
+    assert "| none |" in distractors and "dynamic" not in distractors and "videos" not in distractors
+    used = json.loads((written / "croissant.json").read_text())["prov:wasGeneratedBy"]["prov:used"]
+    assert [one["prov:label"] for one in used] == ["the recipe in recipes/"]
     table = pq.read_table(carded / "card/episodes.parquet")
     pq.write_table(table.slice(0, 0), part / "card/episodes.parquet")
     said = invoke("card", part, "--check", code=1).output
@@ -187,6 +195,10 @@ def test_the_control_steps_of_a_step_are_the_recipes(repeat, held, tmp_path):
 def test_a_card_replaces_no_other_readme_and_needs_a_release(carded, tmp_path):
     with pytest.raises(StoreError, match="holds no release"):
         write_card(tmp_path)
+    begun = shutil.copytree(carded, tmp_path / "begun", ignore=lambda *_: ["manifest.json"])
+    with pytest.raises(StoreError, match="is not complete; finish it with the same rollout"):
+        write_card(begun)
+    shutil.rmtree(begun)
     (tmp_path / "README.md").write_text("mine")
     with pytest.raises(StoreError, match="README.md is not a card, and it would be replaced"):
         write_card(carded, tmp_path)

@@ -10,7 +10,8 @@ import pytest
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import RenderingError, StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.release.fetch import fetch
+from dmcvb_gen.release.fetch import download, fetch
+from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify, verify_folder
 from tests.conftest import invoke, rewrite, roll_out, small_recipe, wrong_files
 
@@ -28,6 +29,21 @@ def test_a_sound_release_passes(release, request):
     assert result.digest == sha256_file(folder / "manifest.json") and not result.compared
     said = invoke("verify", f"{folder}@sha256:{'0' * 64}", code=2).output
     assert f"is release {result.digest}, not 0000" in said
+
+
+def test_all_count_the_files_that_the_digest_covers(small_release, tmp_path):
+    url, part = f"file:{tmp_path / 'there'}", tmp_path / "part"
+    count = publish(small_release, url).files
+    uncovered = {"zarr.json", "manifest.json", "LICENSE"}
+    files = [path for path in tmp_path.rglob("*") if path.is_file() and path.name not in uncovered]
+    assert count == sum("provenance" not in path.parts for path in files)
+    for release, everything in ((small_release, False), (url, True), (url, False)):
+        assert verify(release, everything=everything).covered == count
+    assert f"files of {count})" in invoke("verify", url, code=0).output
+    options = dict(url=url, out=part, only="*/none", episode_range=None, workers=1, progress=False, paint=False)
+    moved, _ = download(options | {"storage_options": None})
+    found = verify(part)
+    assert moved.files == found.covered == found.checked["files"]
 
 
 def swap_rewards(arrays):
