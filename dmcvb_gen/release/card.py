@@ -18,7 +18,7 @@ import yaml
 from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest
+from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest, Resolved
 from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.distractors.registry import distractors_of
@@ -105,7 +105,7 @@ def _write_files(
     return [*texts, SHEET, TABLE]
 
 
-def _published(folder: Path, manifest: Manifest, url: str | None = None) -> Publication:
+def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = None) -> Publication:
     """Place and day of publication: the given one, else those of the existing card of this version, else today."""
     try:
         known = json.loads((folder / CROISSANT).read_text())
@@ -182,7 +182,7 @@ def _summary(release: Release, facts: dict[str, Any]) -> str:
     return text.strip()
 
 
-def header(manifest: Manifest, steps: int) -> str:
+def header(manifest: Manifest | Resolved, steps: int) -> str:
     """The YAML header that the Hugging Face Hub reads."""
     category = next((name for limit, name in SIZES if steps < limit), "n>10M")
     facts = {
@@ -228,7 +228,7 @@ def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Seq
 HELD = {1: "one control step", 2: "two control steps", 4: "four control steps"}
 
 
-def _held(manifest: Manifest) -> str:
+def _held(manifest: Manifest | Resolved) -> str:
     """The control steps for which an action is held, in words."""
     return " or ".join(HELD[repeat] for repeat in sorted({record.action_repeat for record in manifest.subsets}))
 
@@ -251,7 +251,7 @@ BACKGROUND = "background"
 STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 
 
-def _distractors(manifest: Manifest) -> list[tuple[str, str]]:
+def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, str]]:
     """Rows (setting, what varies and how much) of the table of distractors; none for mazes alone."""
     settings: dict[str, DistractorSetting] = {}
     for record in manifest.subsets:
@@ -292,7 +292,7 @@ def _making(release: Release) -> list[str]:
     return [*lines, *(f"Derived: {source}." for source in derived_from(release))]
 
 
-def _policies(manifest: Manifest) -> list[tuple[str, str, str]]:
+def _policies(manifest: Manifest | Resolved) -> list[tuple[str, str, str]]:
     """Rows (task, level, policies) of the table of behaviour policies."""
     rows = []
     for record in {(r.task, r.level): r for r in manifest.subsets}.values():
