@@ -10,7 +10,7 @@ import pytest
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import RenderingError, StoreError
 from dmcvb_gen.files import sha256_file
-from dmcvb_gen.release.fetch import download, fetch
+from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify, verify_folder
 from tests.conftest import invoke, rewrite, roll_out, small_recipe, wrong_files
@@ -37,10 +37,9 @@ def test_all_count_the_files_that_the_digest_covers(small_release, tmp_path):
     for release, everything in ((small_release, False), (url, True), (url, False)):
         assert verify(release, everything=everything).covered == count
     assert f"files of {count})" in invoke("verify", url, code=0).output
-    options = dict(url=url, out=part, only="*/none", episode_range=None, workers=1, progress=False, paint=False)
-    moved, _ = download(options | {"storage_options": None})
+    moved = json.loads(invoke("fetch", url, "--only", "*/none", "--out", part, "--json", code=0).stdout)
     found = verify(part)
-    assert moved.files == found.covered == found.checked["files"]
+    assert moved["files"] == found.covered == found.checked["files"]
 
 
 def swap_rewards(arrays):
