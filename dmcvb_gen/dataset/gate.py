@@ -55,7 +55,7 @@ from dmcvb_gen.text import pluralize
 
 READERS = 16
 """Small files of a bucket that are read at a time."""
-_PINNED = re.compile(r"(?P<place>.+)@sha256:(?P<digest>[0-9a-f]{64})")
+_PINNED = re.compile(r"(?P<place>.+)@(?P<digest>sha256:.*|[0-9a-fA-F]{64})")
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,7 @@ class Release:
             if pinned := _PINNED.fullmatch(str(place)):
                 place, digest = pinned["place"], pinned["digest"]
             place = open_store(place, options)
+        digest = None if digest is None else _plain_digest(digest)
         store, path = place, MANIFEST
         try:
             text = store.read(path, MANIFEST_BYTES)
@@ -397,6 +398,14 @@ def _with_own_images(store: Store, manifest: Manifest) -> Manifest:
 
 
 # -- small files ----------------------------------------------------------------------------------
+
+
+def _plain_digest(given: str) -> str:
+    """The 64 digits of a digest as people write it: with or without "sha256:", in either case."""
+    digest = given.lower().removeprefix("sha256:")
+    if not re.fullmatch("[0-9a-f]{64}", digest):
+        raise StoreError(f"{given!r} is no digest; give 64 hexadecimal digits: RELEASE@sha256:DIGEST")
+    return digest
 
 
 def read_recipe(store: Store, digest: str) -> Resolved:

@@ -72,10 +72,10 @@ def fetch(
 
 def download(given: Mapping[str, Any], notify: Callable[[str], None] = ignore) -> tuple[Moved, "RenderResult | None"]:
     """Do what the arguments of `fetch` ask for: what was moved and, with `paint`, what was rendered."""
-    only, episodes = as_names(given["only"]), given["episode_range"]
+    only, episodes, folder = as_names(given["only"]), given["episode_range"], local_path(given["out"])
     with progress_bar(given["progress"], "B") as bar:
         source = Release.open(given["url"], given["storage_options"], own_images=False)
-        download = _Download(source, local_path(given["out"]), given["repair"], given["workers"], bar)
+        download = _Download(source, folder, given["repair"], given["workers"], bar)
         moved = _fetch(source, given["url"], download, only, episodes)
     if not given["paint"]:
         return moved, None

@@ -13,8 +13,8 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.storage.places import is_url, shown
 
 CLIENTS = frozenset(
-    "adlfs aiobotocore aiohttp asyncio azure botocore fsspec gcsfs google httpcore httpx huggingface_hub requests s3fs "
-    "ssl urllib3".split()
+    "adlfs aiobotocore aiohttp asyncio azure botocore fsspec gcsfs google httpcore httpx httpx2 huggingface_hub "
+    "requests s3fs ssl urllib3".split()
 )
 """Packages whose exceptions come from a network or a disk."""
 DECODERS = frozenset(("numcodecs", "zarr"))
@@ -60,7 +60,8 @@ def storage_errors(place: str | Path, doing: str = "read", decoding: bool = Fals
         if not (decoding or package in CLIENTS | DECODERS or isinstance(error, OSError | ImportError)):
             raise
         kind = Refused if isinstance(error, PermissionError) else StoreError
-        raise kind(_explained(error, str(place), doing, package in CLIENTS)) from None
+        client = package in CLIENTS or isinstance(error.__cause__, OSError)
+        raise kind(_explained(error, str(place), doing, client)) from None
 
 
 def reason(error: BaseException) -> str:
@@ -86,6 +87,8 @@ def _explained(error: Exception, place: str, doing: str, client: bool) -> str:
         where = error.filename  # the file that failed, e.g. of a scratch folder
     if error.errno in NO_ROOM:
         return f"no room to {doing} {where} ({error.strerror}); make room and rerun the same command"
+    if not url and (file := next((str(path) for path in Path(where).parents if path.is_file()), None)):
+        return f"cannot {doing} {where}: {file} is a file; choose another place"
     if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError):
         there = "create the bucket first" if url else "create the folder first, or choose another place"
         cure = "check the path, or fetch or regenerate it" if doing == "read" else there

@@ -78,6 +78,7 @@ OTHERS = [
     ("--fast", "`dmcvb-gen --help` lists the options"),
     ("rolout", "Did you mean 'rollout'?"),
     ("info", "see `dmcvb-gen info --help`"),
+    ("rollout walker-walk --level random --no-pixels --out hole.txt/r", "hole.txt is a file; choose another place"),
     ("info empty", "holds no release"),
     ("info s3://", "s3:// names no bucket; give s3://BUCKET/NAME"),
     ("diff a b c", "see `dmcvb-gen diff --help`"),

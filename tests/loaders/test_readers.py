@@ -251,7 +251,11 @@ def test_a_shard_costs_a_web_server_a_handful_of_requests(small_release):
 
 def test_a_digest_from_outside_is_compared(small_release):
     digest = dmcvb_gen.open(small_release).digest
-    assert dmcvb_gen.open(f"{small_release}@sha256:{digest}").compared
+    for spelling in (f"@sha256:{digest}", f"@sha256:{digest.upper()}", f"@{digest}"):
+        assert dmcvb_gen.open(f"{small_release}{spelling}").compared
+    assert dmcvb_gen.open(small_release, digest=f"sha256:{digest}").compared
+    with pytest.raises(StoreError, match="'sha256:12' is no digest; give 64 hexadecimal digits"):
+        dmcvb_gen.open(f"{small_release}@sha256:12")
     for paint in (False, True):
         with pytest.raises(StoreError, match=f"is release {digest}"):
             dmcvb_gen.open(small_release, digest="0" * 64, paint=paint)

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 
 from dmcvb_gen.dataset.manifest import ShardFile
 from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import Place, local_path, shown
 from dmcvb_gen.storage.store import NotThere, open_store
 from dmcvb_gen.storage.zarr_files import ZarrFiles
@@ -550,3 +551,14 @@ def test_a_package_that_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     with pytest.raises(StoreError, match="pip install gcsfs"):
         open_store("gs://bucket/x").read("a", 1)
+
+
+def test_a_network_that_is_away_is_no_damage():
+    class ClientError(Exception):
+        """Of a client that is not known by name."""
+
+    with (
+        pytest.raises(StoreError, match="check the URL and the network"),
+        storage_errors("hf://datasets/a/b", decoding=True),
+    ):
+        raise ClientError("no address") from socket.gaierror(-2, "Name or service not known")
