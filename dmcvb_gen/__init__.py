@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.register import register_with_gymnasium
 from dmcvb_gen.version import __version__
 
@@ -81,18 +80,17 @@ def open(
       storage_options: options of the storage client, for a URL.
       digest: SHA-256 of the manifest, from a source that you trust; compared before anything else is read.
       paint: paint pictures when they are read instead of reading them; needs the simulator installed.
-      painting: how, with `paint` (`dmcvb_gen.loaders.painted.Painting`): distractors="stored" (those of the data) or
-        "resample" (fresh ones for each `set_epoch`), size, backgrounds, cache_bytes (painted episodes kept a subset).
+      painting: how, which implies `paint` (`dmcvb_gen.loaders.painted.Painting`): distractors="stored" (those of the
+        data) or "resample" (fresh ones for each `set_epoch`), size, backgrounds, cache_bytes (painted episodes kept a
+        subset).
 
     Raises:
       StoreError: there is no release, it cannot be read, it has another digest, or the URL needs a package that is
         not installed.
-      DmcvbError: `painting` has an unknown value or is given without `paint`, or all of the release was imported.
+      DmcvbError: `painting` has an unknown value, or all of the release was imported.
       TypeError: `painting` has an unknown field.
     """
-    if painting and not paint:
-        raise DmcvbError(f"{min(painting)} says how images are rendered when they are read; add paint=True")
-    if paint:
+    if paint or painting:
         from dmcvb_gen.dataset.gate import Release
         from dmcvb_gen.loaders.painted import Painting, painted_release
 
