@@ -209,7 +209,6 @@ def test_values_that_make_no_sense_are_refused_by_name(subset):
         (lambda: next(subset.batches(8, seed=-1)), "seed is -1; give a whole number of at least 0"),
         (lambda: subset.source(stack=-1), "stack is -1; give a whole number"),
         (lambda: subset.torch("steps", stack=0), "stack is 0; give a whole number"),
-        (lambda: dmcvb_gen.open(subset.release.path, distractors="resample"), "distractors says how .* paint=True"),
     ):
         with pytest.raises(DmcvbError, match=words):
             make()
