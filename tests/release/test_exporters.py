@@ -204,6 +204,8 @@ def test_rlds_has_dmc_vbs_names(small_release, tmp_path):
     step = json.loads(described.read_text())["featuresDict"]["features"]["steps"]["sequence"]["feature"]
     observation = step["featuresDict"]["features"]["observation"]["featuresDict"]["features"]
     assert observation["height"]["tensor"]["shape"] == {} and observation["velocity"]["tensor"]["dtype"] == "float64"
+    names = json.loads(described.with_name("metadata.json").read_text())
+    assert names["action"][-1] == "left_ankle" and names["joints"][-1] == "left_ankle"
 
 
 def test_a_zarr_group_has_all_arrays_of_a_subset_for_zarr_and_xarray(source, tmp_path):

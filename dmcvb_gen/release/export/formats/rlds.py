@@ -18,7 +18,8 @@ _FEATURES = "tensorflow_datasets.core.features"
 
 @register_exporter("rlds", mark="dataset_info.json")
 def write(source: Source, folder: Path) -> None:
-    """Write `<version>/`: `dataset_info.json`, `features.json` and the TFRecord shards of a split "train".
+    """Write `<version>/`: `dataset_info.json`, `features.json` and the TFRecord shards of a split "train", and the names
+    of the joints and of the entries of state and action in `metadata.json` (TFDS's place for what features cannot say).
 
     A step has observation/<view>, observation/state, action, reward, discount, is_first, is_last, is_terminal, and
     the state's parts once more under the names and types of DMC-VB's own data set (observation/velocity, ...;
@@ -58,6 +59,7 @@ def write(source: Source, folder: Path) -> None:
     }
     (target / "dataset_info.json").write_text(json.dumps(info, indent=1))
     (target / "features.json").write_text(json.dumps(_features(source), indent=1))
+    (target / "metadata.json").write_text(json.dumps(source.names | {"joints": source.joints}, indent=1))
 
 
 # -- what the features are ------------------------------------------------------------------------
