@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import logging
 import signal
 import sys
 import threading
@@ -159,6 +160,7 @@ def _stop_on_signals(context: click.Context) -> None:
     def stop(*_):
         _asked_to_stop.set()
         sys.unraisablehook = lambda *_: None  # what is half begun (an event loop, say) has nothing to tell any more
+        logging.getLogger("asyncio").disabled = True  # nor have the tasks of that loop
         warnings.simplefilter("ignore")
         raise KeyboardInterrupt
 

@@ -18,8 +18,8 @@ _FEATURES = "tensorflow_datasets.core.features"
 
 @register_exporter("rlds", mark="dataset_info.json")
 def write(source: Source, folder: Path) -> None:
-    """Write `<version>/`: `dataset_info.json`, `features.json` and the TFRecord shards of a split "train", and the names
-    of the joints and of the entries of state and action in `metadata.json` (TFDS's place for what features cannot say).
+    """Write `<version>/`: `dataset_info.json`, `features.json`, the TFRecord shards of a split "train", and in
+    `metadata.json` (TFDS's place for what features cannot say) the names of joints and of state's and action's entries.
 
     A step has observation/<view>, observation/state, action, reward, discount, is_first, is_last, is_terminal, and
     the state's parts once more under the names and types of DMC-VB's own data set (observation/velocity, ...;
