@@ -12,7 +12,9 @@ A batch is one gather from these rows, never a loop over samples.
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -191,11 +193,14 @@ def _mapped(shape: tuple[int, ...], folder: Path) -> np.ndarray:
     needed = math.prod(shape)
     folder.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(folder).free
-    if needed > free:
-        raise DmcvbError(
-            f"{format_bytes(needed)} of images fit neither into memory nor into {folder} ({format_bytes(free)} "
-            "free); give another --out, or more --memory"
-        )
     with tempfile.TemporaryFile(dir=folder) as file:
-        file.truncate(needed)
+        try:
+            if needed > free:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.posix_fallocate(file.fileno(), 0, needed)  # a hole that others fill meanwhile would kill this process
+        except OSError as error:
+            raise DmcvbError(
+                f"{format_bytes(needed)} of images fit neither into memory nor into {folder} ({format_bytes(free)} "
+                f"free; {error.strerror}); give another --out, or more --memory"
+            ) from None
         return np.memmap(file, np.uint8, "r+", shape=shape)

@@ -2,7 +2,7 @@
 
 Settings are the arguments of the algorithm's class. Policies are exported as everybody's zips are, by
 `policies.convert`. A run goes on from SB3's own parameters and its replay buffer, with new episodes; nothing is
-unpickled.
+unpickled. Steps of an on-policy algorithm since its last update are not kept.
 """
 
 from __future__ import annotations
@@ -82,7 +82,14 @@ def check(run: Run) -> None:
     """
     if run.config.init_from:
         raise DmcvbError(f"--init-from has no effect with --algo {run.config.algorithm}: remove it")
-    export(run, make_model(run))
+    model = make_model(run)
+    export(run, model)
+    first = getattr(model, "n_steps", 0) * run.settings.simulations or getattr(model, "learning_starts", 0)
+    if run.config.steps < first:
+        raise DmcvbError(
+            f"{run.config.algorithm} learns from step {first:,} on, and {run.config.steps:,} are asked for; give more "
+            "--steps, or less n_steps or learning_starts with --set"
+        )
 
 
 def make_model(run: Run) -> BaseAlgorithm:
@@ -94,12 +101,15 @@ def make_model(run: Run) -> BaseAlgorithm:
     given = {name: value for name, value in vars(run.settings).items() if name not in OURS}
     if isinstance(noise := given.get("action_noise"), int | float):
         given["action_noise"] = NormalActionNoise(np.zeros(run.task.action_size), np.full(run.task.action_size, noise))
-    env: Any = TaskVecEnv(run.task, run.settings.simulations, run.config.seed)
+    seed = run.config.seed
+    if run.step:  # it goes on, with new episodes and new noise
+        seed = int(np.random.default_rng([seed, run.step]).integers(2**31))
+    env: Any = TaskVecEnv(run.task, run.settings.simulations, seed)
     if run.settings.normalize_observation or run.settings.normalize_reward:
         norms = {"norm_obs": run.settings.normalize_observation, "norm_reward": run.settings.normalize_reward}
         env = VecNormalize(env, **norms)
     try:
-        model = algorithm_class(run.config.algorithm)("MlpPolicy", env, seed=run.config.seed, device="cpu", **given)
+        model = algorithm_class(run.config.algorithm)("MlpPolicy", env, seed=seed, device="cpu", **given)
     except (ValueError, TypeError, AssertionError) as error:
         reason = " ".join(str(error).split())
         raise DmcvbError(f"{run.config.algorithm} does not accept this: {reason}; change it with --set") from None
@@ -125,6 +135,7 @@ def state_of(model: BaseAlgorithm) -> dict[str, Any]:
     """What a run goes on from."""
     variables = {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
     state: dict[str, Any] = {"parameters": model.get_parameters(), "variables": variables}
+    state["updates"] = model._n_updates
     if normalize := model.get_vec_normalize_env():
         norms = {name: getattr(normalize, name) for name in ("obs_rms", "ret_rms") if hasattr(normalize, name)}
         state["norms"] = {n: [torch.as_tensor(v) for v in (rms.mean, rms.var, rms.count)] for n, rms in norms.items()}
@@ -146,7 +157,7 @@ def restore(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
         for name, value in saved["buffer"].items():
             getattr(model.replay_buffer, name)[: len(value)] = value.numpy()
         model.replay_buffer.pos, model.replay_buffer.full = saved["position"], saved["full"]
-    model.num_timesteps = saved["step"]
+    model.num_timesteps, model._n_updates = saved["step"], saved["updates"]
 
 
 def train(run: Run) -> None:

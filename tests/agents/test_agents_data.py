@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 from types import SimpleNamespace
 
 import numpy as np
@@ -194,8 +195,13 @@ def test_the_disk_is_asked_for_every_frame_of_a_batch_and_for_little_more(small_
     assert asked == [(one * frame, (int(row) + 1) * frame) for one, row in zip(first, rows, strict=True)]
 
 
-def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch):
-    monkeypatch.setattr(steps_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
+@pytest.mark.parametrize("free", [1000, 10**12])  # more, and then another process takes it
+def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch, free):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(steps_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    monkeypatch.setattr(steps_module.os, "posix_fallocate", full)
     with pytest.raises(DmcvbError, match="fit neither into memory nor into .* another --out, or more --memory"):
         load_data(Release.open(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
 

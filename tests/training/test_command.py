@@ -127,6 +127,10 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
         (["walker-walk", "--set", "learning_rat=3"], "Did you mean 'learning_rate'?"),
         (["walker-walk", "--algo", "sb3:PPO", "--set", "buffer_size=3"], "clip_range"),
         (["walker-walk", "--algo", "sb3:PPPO"], "Did you mean 'PPO'?"),
+        (
+            ["walker-walk", "--algo", "sb3:PPO", "--steps", "1600"],
+            "learns from step 16,384 on, and 1,600 are asked for",
+        ),
         (["walker-walk", "--set", "foo=1"], "more; --list-settings lists them all."),
         (["walker-walk", "--set", "speed"], "key=value"),
         (["walker-walk", "--set", "discount=1.5"], "setting discount of sac is 1.5: input should be less than 1"),

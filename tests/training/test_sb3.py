@@ -62,14 +62,17 @@ def test_an_exported_policy_acts_as_the_model_it_comes_from(tmp_path, models, mo
 def test_a_resumed_run_has_networks_normalization_and_buffer(tmp_path, models, algorithm):
     opened(tmp_path / "run", algorithm, steps=120, every=400).train()
     before, again = models[-1], opened(tmp_path / "run", algorithm, resume=True, steps=400, every=400)
+    again.step = again.saved()["step"]
     model = sb3.make_model(again)
     sb3.restore(model, again.saved())
+    assert model._n_updates == before._n_updates > 0
     for name, value in before.policy.state_dict().items():
         torch.testing.assert_close(model.policy.state_dict()[name], value, rtol=0, atol=0)
     np.testing.assert_array_equal(model.get_env().obs_rms.mean, before.get_env().obs_rms.mean)
     if algorithm == "sb3:SAC":
         np.testing.assert_array_equal(model.replay_buffer.actions, before.replay_buffer.actions)
         assert (model.replay_buffer.pos, float(model.log_ent_coef)) == (29, float(before.log_ent_coef))
+    assert (model.get_env().reset() != sb3.make_model(opened(tmp_path / "new", algorithm)).get_env().reset()).any()
 
 
 # -- its episodes: actions in their bounds, correct ends -----------------------------------------------
