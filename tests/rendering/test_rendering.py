@@ -72,7 +72,7 @@ class RendererTests:
         assert 0.01 < changed.mean() < 0.4 and (greener > 0).mean() > 0.9
         renderer.close()
 
-    @pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk"])
+    @pytest.mark.parametrize("task_id", ["walker-walk", "humanoid-walk", "reacher-easy"])
     def test_a_background_changes_the_sky_alone_unless_the_floor_is_seen_through(self, task_id):
         task, setting, physics, labels = frames_of(task_id, "static", 4)
         renderer = renderer_of(self.name, task, setting)

@@ -653,14 +653,15 @@ def paint_frames(scene, frames, scratch, stays, shown, hidden):
 
 @entry
 def label_frames(scene, frames, scratch, depth, geom):
-    """Depth (0: sky) and geom (-1: sky) of frames, from each pixel's first sample. Planes hide what is behind them."""
+    """Depth (0: sky) and geom (-1: sky) of frames, from each pixel's first sample. Planes hide what is behind them,
+    but for those that are not painted."""
     k, rec, inverse, number = scratch.k, scratch.rec, scratch.inverse, scratch.number
     k[: scene.constants.size] = scene.constants
     pixels = scene.rays.size // 9
     for f in range(frames.look.size):
         pose(scene, frames, scratch, f, pixels)
         for g in range(rec.shape[0]):
-            rec[g, L.OWN_OPACITY] = 1.0 / BACK_OF_PLANE
+            rec[g, L.OWN_OPACITY] = 1.0 / BACK_OF_PLANE if rec[g, L.OWN_OPACITY] > 0.0 else 0.0
         face_planes(rec)
         clear(inverse, number, k, pixels)
         draw_bodies(inverse, number, scene.rays, k, rec, i8(ALL), i8(L.PLACE), i8(L.AXIS))
