@@ -22,6 +22,7 @@ ROLL_VELOCITY_STD = np.pi / 300  # times s, radians a tick
 MAX_ROLL_SPEED = np.pi / 50  # times s, radians a tick
 ANGLE_RANGE = np.pi / 2  # times s: half width of azimuth, elevation and roll, radians
 RADIUS_RANGE = (0.5, 1.5)  # times s: how much nearer and farther than r0, as a share of r0
+OVERHEAD = 0.9  # a nominal camera is overhead (or below) if more than this share of its distance is vertical
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,21 @@ def cartesian(coordinates: np.ndarray) -> np.ndarray:
     return np.stack([flat * cos_azimuth, flat * sin_azimuth, coordinates[0] * cos_polar])
 
 
-def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
+def is_overhead(offset: np.ndarray) -> bool:
+    """Return True if a nominal camera is so near the vertical that its azimuth says nothing, as reacher's is.
+
+    Args:
+      offset: (3,) nominal camera minus centre of mass, meters.
+    """
+    return bool(abs(offset[2]) > OVERHEAD * arithmetic.norm(offset))
+
+
+def turned(axes: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Sum of the columns of `axes`, (3, 3), weighed by each of the vectors (..., 3)."""
+    return arithmetic.total(axes.T.reshape(3, *(1,) * (vectors.ndim - 1), 3) * np.moveaxis(vectors, -1, 0)[..., None])
+
+
+def camera_range(offset: np.ndarray, setting: DistractorSetting, overhead: bool = False) -> CameraRange:
     """The ranges around a nominal camera.
 
     The camera stays above the agent's center of mass and on its side of the plane y = 0, in front of the scenery. A
@@ -59,11 +74,12 @@ def camera_range(offset: np.ndarray, setting: DistractorSetting) -> CameraRange:
 
     Args:
       offset: (3,) nominal camera minus centre of mass, meters.
+      overhead: z points to the top of the nominal image, in which the camera may also go down.
     """
     radius, polar, azimuth = spherical(offset)
     scale = setting.scale_of("camera")
     angle = ANGLE_RANGE * scale
-    horizon = np.pi / 2 if polar - angle < np.pi / 2 else np.pi
+    horizon = np.pi / 2 if polar - angle < np.pi / 2 and not overhead else np.pi
     side = (-np.pi, 0.0) if azimuth <= 0 else (0.0, np.pi)
     low = np.array([radius * (1 - RADIUS_RANGE[0] * scale), max(polar - angle, 0.0), max(azimuth - angle, side[0])])
     high = np.array(
@@ -179,11 +195,17 @@ class Camera(Distractor):
 
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
         self._task, model, camera = scene.task, scene.task.model, camera_ids(scene.task)[0]
-        offset = np.asarray(model.cam_poscom0[camera])
-        bounds = camera_range(offset, scene.setting)
-        self._offset, roll = camera_walk(bounds, scene.setting, scene.frames, generators, scene.task.action_repeat)
-        target = nominal_target(offset, model.cam_mat0[camera].reshape(3, 3))
-        self._quaternion = quaternions(look_at(self._offset - target, roll))
+        offset, rotation = np.asarray(model.cam_poscom0[camera]), model.cam_mat0[camera].reshape(3, 3)
+        overhead = is_overhead(offset)
+        if overhead:  # walk as if the nominal image stood upright: right is x, into the image y, up z
+            axes = np.stack([rotation[:, 0], -rotation[:, 2], rotation[:, 1]], axis=1)
+            offset, rotation = turned(axes.T, offset), turned(axes.T, rotation.T).T
+        bounds = camera_range(offset, scene.setting, overhead)
+        walk, roll = camera_walk(bounds, scene.setting, scene.frames, generators, scene.task.action_repeat)
+        matrices = look_at(walk - nominal_target(offset, rotation), roll)
+        if overhead:
+            walk, matrices = turned(axes, walk), turned(axes, matrices.swapaxes(-1, -2)).swapaxes(-1, -2)
+        self._offset, self._quaternion = walk, quaternions(matrices)
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
         lead, flat = physics.shape[:-1], physics.reshape(-1, physics.shape[-1])

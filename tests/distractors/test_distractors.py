@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import ks_2samp, kstest
 
 from dmcvb_gen.distractors import Distractor, DistractorSetting, load_backgrounds, sample_distractors
@@ -110,6 +111,25 @@ def test_the_camera_looks_where_the_nominal_one_does(task_id):
         beside.append(np.arccos((center - nominal) @ -back / np.linalg.norm(center - nominal)))
     if task_id != "humanoid-walk":  # looking at the centre of mass itself would be another picture
         np.testing.assert_allclose(beside, {"walker-walk": 0.024, "cheetah-run": 0.046}[task_id], rtol=0.2)
+
+
+@pytest.mark.parametrize("scale", [0.001, 0.2])
+@pytest.mark.parametrize("task_id", ["reacher-easy", "point_mass-easy", "fish-swim", "walker-walk"])
+def test_pictures_turn_no_more_than_the_scale_says(task_id, scale):
+    """Also of cameras straight overhead, around which azimuth turns by any angle in no time."""
+    task = get_task(task_id)
+    physics = np.repeat(physics_of(task, 8, 1), 100, axis=1)
+    found = labels(task, f"dynamic_camera{scale}", physics)
+    nominal = matrices(nominal_cameras(task, physics[0, :1])[1][0, 0].astype(float))
+    axes = matrices(found.camera_quaternion[:, :, 0].astype(float))
+    angle = np.pi / 2 * scale
+    from_nominal = Rotation.from_matrix((axes @ nominal.T).reshape(-1, 3, 3)).magnitude()
+    assert from_nominal.max() < 3 * angle + 1e-3 and np.ptp(from_nominal) > angle
+    right = axes[..., 0]
+    assert np.arccos(np.clip((right[:, 1:] * right[:, :-1]).sum(-1), -1, 1)).max() < angle / 2 + 1e-3
+    place = centers_of_mass(task, physics[0, :1])[0] + task.model.cam_poscom0[camera_ids(task)[0]]
+    moved = (found.camera_position[:, :, 0] - place) @ nominal[:, :2]  # to the picture's right and top: either way
+    assert (moved.min(axis=(0, 1)) < 0).all() and (moved.max(axis=(0, 1)) > 0).all()
 
 
 def test_static_varies_between_episodes_and_never_within_one():
