@@ -179,7 +179,6 @@ class TrainingData:
       start, end: (row,) long, first and last row of the row's episode.
       normalization: normalization of the states, from the training episodes.
       train_rows, hold_out_rows: (n,) long, rows that hold a transition.
-      episode: (row,) long, index of the row's episode in its subset.
       latent: (row, latent) float32 of a frozen encoder (`encoded`); None elsewhere.
     """
 
@@ -200,7 +199,6 @@ class TrainingData:
         self.action, self.reward, self.discount = (value.float() for value in values)
         held = torch.from_numpy(out).to(device)
         self.train_rows, self.hold_out_rows = rows[~held[rows]], rows[held[rows]]
-        self.episode = torch.from_numpy(table.episode).to(device)
         self.normalization = Normalization.of(state[~held])
         self.state = self.normalization(state.float())
         self.frames = None if table.frames is None else FrameTable(table.frames, device)
@@ -337,8 +335,8 @@ class TrainingData:
         return self._with(frames=None)
 
     def with_labels(self, episodes: np.ndarray) -> TrainingData:
-        """The same episodes, of which some are labeled: tests are of others."""
-        labeled = torch.isin(self.episode, self._to_device(episodes))
+        """The same episodes, of which some are labeled, (episode,) bool: tests are of others."""
+        labeled = self._to_device(np.repeat(episodes, self.lengths + 1))
         rows = torch.cat([self.train_rows, self.hold_out_rows])
         tests = self.hold_out_rows[~labeled[self.hold_out_rows]]
         return self._with(labeled_rows=rows[labeled[rows]], hold_out_rows=tests)
@@ -418,9 +416,18 @@ def choose_episodes(subset: Subset, part: Slice, seed: int) -> tuple[np.ndarray,
     count = min(part.episodes or part_count(part.share, len(names)), len(names))
     chosen = np.random.default_rng(seed).permutation(len(names))[:count]
     few = part.episodes is not None or part.goal_pair is not None
-    held = np.arange(count) < (0 if few else min(math.ceil(HOLD_OUT * count), count - 1))
+    held_out = 0 if few else min(math.ceil(HOLD_OUT * count), count - 1)
+    held = np.arange(count) >= count - held_out  # the last: labeled few are the first, and are learned from
     by_name = np.argsort(names[chosen])
     return names[chosen][by_name], held[by_name]
+
+
+def labeled_episodes(release: Release, slices: Sequence[Slice], labels: Sequence[Slice], seed: int) -> np.ndarray:
+    """(episode,) bool: which episodes of the slices are among the labeled ones, in the order of `load_data`."""
+    split = [(part.subset, *choose_episodes(release[part.subset], part, seed)) for part in labels]
+    known = {(subset, episode) for subset, episodes, held in split for episode in episodes[~held]}
+    chosen = [(part.subset, choose_episodes(release[part.subset], part, seed)[0]) for part in slices]
+    return np.array([(subset, episode) in known for subset, episodes in chosen for episode in episodes])
 
 
 def default_memory(device: str = "cpu") -> int:

@@ -31,7 +31,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
-from dmcvb_gen.agents.data import TrainingData, choose_episodes, default_memory, load_data
+from dmcvb_gen.agents.data import TrainingData, default_memory, labeled_episodes, load_data
 from dmcvb_gen.agents.learners import Learner, Policy
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.probe import action_probe
@@ -51,7 +51,7 @@ from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.version import __version__
 
-RESULT_VERSION = 6
+RESULT_VERSION = 7
 INSPECTED = 150_000
 """Held-out transitions that an inspection's error is the mean of, at most (the paper's number)."""
 
@@ -223,8 +223,9 @@ class CellRun:
         """Train an encoder and keep it."""
         budget, agent = self.budget, self.cell.agent
         data = self.data(stack=agent.stack)
-        for labels in self.cell.pretrain:
-            data = data.with_labels(choose_episodes(self.release[labels.subset], labels, budget.seed)[0])
+        if self.cell.pretrain:
+            labels = labeled_episodes(self.release, self.cell.policy, self.cell.pretrain, budget.seed)
+            data = data.with_labels(labels)
         torch.manual_seed(budget.seed)
         encoder = make_encoder(agent, data.sizes, architecture=budget.network)
         learner = make_pretrainer(agent, encoder, data.sizes, budget.network).to(budget.device)

@@ -377,13 +377,20 @@ def plan_benchmark(name: str, release: Release, agents: Sequence[str] = ()) -> t
         of their own, beside BC without.
 
     Raises:
-      DmcvbError: no such benchmark or agent.
+      DmcvbError: no such benchmark or agent, or an agent's labels are not of its encoder's subsets.
     """
     benchmark, data = BENCHMARKS.get(name), SubsetFinder(release)
     chosen = [parse_agent(agent) for agent in agents or benchmark.agents]
     if benchmark.compares_encoders:
         chosen = [agent for agent in chosen if agent.pretrain]
     cells = list(benchmark.cells(data, chosen))
+    for encoder in [cell.encoder for cell in cells if cell.encoder]:
+        images, labels = ({part.subset for part in parts} for parts in (encoder.policy, encoder.pretrain))
+        if not labels <= images:
+            raise DmcvbError(
+                f"{name}: agent {encoder.agent.name} learns from labels among its encoder's episodes, which are of "
+                f"{', '.join(sorted(images))}; remove it, or ask for --benchmark b4"
+            )
     return list(dict.fromkeys(cells)), data.missing(name)
 
 

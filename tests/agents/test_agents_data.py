@@ -106,7 +106,7 @@ def test_the_later_observation_is_k_steps_on_and_the_next_one_a_step():
 
 
 def test_labeled_transitions_are_those_of_some_episodes_and_tests_are_of_others():
-    data = make_data(held=(True, True, False)).with_labels(np.array([0, 2]))
+    data = make_data(held=(True, True, False)).with_labels(np.array([True, False, True]))
     drawn = data.labeled().batch(200, np.random.default_rng(0), next_observation=True, shift=False)
     rows = drawn.reward.long()
     assert set(rows.tolist()) == {0, 1, 2, 3, 13, 14}

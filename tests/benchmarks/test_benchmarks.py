@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 
 from dmcvb_gen import own_code
 from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
-from dmcvb_gen.agents.data import Normalization, Slice, choose_episodes, load_data, normalize_pixels
+from dmcvb_gen.agents.data import Normalization, Slice, choose_episodes, labeled_episodes, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
@@ -146,8 +146,30 @@ def test_a_smaller_label_budget_is_a_part_of_a_larger_one_and_hangs_on_the_seed(
             episodes, held_out = choose_episodes(subset, Slice(subset.name, episodes=budget), seed)
             drawn[seed, budget] = set(episodes.tolist())
             assert len(drawn[seed, budget]) == budget and not held_out.any()
+        everything, held_out = choose_episodes(subset, Slice(subset.name), seed)
+        assert held_out.sum() == 10 and not drawn[seed, 128] & set(
+            everything[held_out]
+        )  # their images are learned from
         assert drawn[seed, 2] < drawn[seed, 8] < drawn[seed, 32] < drawn[seed, 128]
     assert drawn[0, 8] != drawn[1, 8]
+
+
+@pytest.mark.parametrize("benchmark, names", [("b2", WALKER), ("b3", FIXED)])
+def test_labels_of_other_subsets_than_the_encoders_are_refused(benchmark, names):
+    with pytest.raises(DmcvbError, match=f"{benchmark}: agent laom-labels.bc learns from labels .* --benchmark b4"):
+        planned(benchmark, *names, agents=["id+bc", "laom-labels+bc"], fixed_goals=5, episodes_per_goal=20)
+
+
+def test_episodes_are_labeled_by_subset_and_number_and_held_out_ones_are_not():
+    release = release_of("walker-walk/expert/none", "walker-walk/medium/none", episodes=20)
+    expert, medium = map(Slice, release.subsets)
+    chosen, held_out = choose_episodes(release[expert.subset], expert, 0)
+    few = choose_episodes(release[expert.subset], Slice(expert.subset, episodes=2), 0)[0]
+    for labels, wanted in (
+        ([expert, medium], [*~held_out, *~held_out]),
+        ([Slice(expert.subset, episodes=2)], [*np.isin(chosen, few), *[False] * 20]),
+    ):
+        np.testing.assert_array_equal(labeled_episodes(release, [expert, medium], labels, 0), wanted)
 
 
 def test_mazes_have_the_papers_two_levels_in_b1_and_others_where_they_are_there():
