@@ -52,6 +52,8 @@ from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.version import __version__
 
 RESULT_VERSION = 7
+PAPER_SIZE = 64
+"""Pixels a side of the paper's images."""
 INSPECTED = 150_000
 """Held-out transitions that an inspection's error is the mean of, at most (the paper's number)."""
 
@@ -312,7 +314,9 @@ class CellRun:
         normal = None
         if best["score"]["limit"] == subset.record.max_steps:  # returns of other lengths are not compared
             normal = normalized(best["score"]["mean"], reference_returns(self.release, subset.record))
-        paper = BENCHMARKS.get(cell.benchmark).paper_score(cell)
+        like_paper = subset.record.action_repeat == ACTION_REPEAT
+        like_paper &= cell.agent.sees_state or subset.record.size == PAPER_SIZE
+        paper = BENCHMARKS.get(cell.benchmark).paper_score(cell) if like_paper else None
         return {
             "labels": {"policy": cell.policy_label, "encoder": cell.pretrain_label},
             "score": best["score"] | {"step": best["step"], "normalized": normal},

@@ -60,9 +60,10 @@ def _simulated(record: SubsetRecord) -> float:
 def _bundled(record: SubsetRecord) -> float | None:
     from dmcvb_gen.policies.bundled import bundled_policies
     from dmcvb_gen.policies.policy_file import read_header
-    from dmcvb_gen.tasks import get_task
+    from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
-    if record.max_steps != get_task(record.task).at(record.action_repeat).max_steps:
+    whole = get_task(record.task).at(record.action_repeat).max_steps
+    if record.action_repeat > ACTION_REPEAT or record.max_steps != whole:
         return None
     try:
         header = read_header(bundled_policies(record.task, "expert")[0])

@@ -34,6 +34,7 @@ from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import PolicyRecord, record_path
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.references import reference_returns
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from tests.conftest import TINY_MAZE, invoke, maze_recipe, rewrite, roll_out, small_recipe
@@ -109,7 +110,8 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     assert page.count("data:image/png;base64") >= 5 and "src='http" not in page and "href=" not in page
     by_agent = {entry["cell"]["agent"]: entry for entry in facts["results"]}
     assert facts["sound"] and set(by_agent) == {"bc", "state-bc", "id+bc"}
-    assert by_agent["bc"]["paper"] == {"mean": 913, "stderr": 10} and by_agent["state-bc"]["share"] == 1
+    assert by_agent["state-bc"]["paper"] == {"mean": 960, "stderr": 2} and by_agent["state-bc"]["share"] == 1
+    assert by_agent["bc"]["paper"] is None  # of images of 64 pixels
     assert by_agent["id+bc"]["pretraining"]["curve"] and by_agent["id+bc"]["inspection"]["state_mse"] > 0
     assert (out / "cells" / "b1_walker-walk_dynamic_bc_expert.decoder.png").exists()
 
@@ -390,6 +392,22 @@ def test_returns_unlike_the_policys_own_fail(release):
     policies = (policy.model_copy(update={"header": policy.header | {"task": "cheetah-run"}}),)
     elsewhere.record = elsewhere.record.model_copy(update={"policies": policies})
     assert not list(check_policy_returns(elsewhere))  # an ant's policy walks in mazes that it was not measured in
+
+
+@pytest.mark.slow_cases("1")
+@pytest.mark.parametrize("repeat", [1, 4])
+def test_returns_of_actions_held_for_longer_are_compared_with_nothing(repeat, tmp_path):
+    """At repeat 1 the policies hold their actions for two steps, as when they were measured."""
+    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 4}
+    roll_out(small_recipe(action_repeat=repeat, subsets=[pattern]), tmp_path / "repeat")
+    result = validate(tmp_path / "repeat", out=tmp_path / "out", agents="state-bc", workers=1)
+    facts = json.loads(result.facts.read_text())
+    assert result.sound and not result.warnings, result.structure
+    [returns], [score] = facts["returns"].values(), facts["results"]
+    assert bool(returns["paper"]) == (repeat == 1) and score["paper"] is None
+    [subset] = Release.open(tmp_path / "repeat").subsets.values()
+    medium = subset.record.model_copy(update={"level": "medium", "setting": "static"})  # of which there are none
+    assert bool(reference_returns(subset.release, medium)) == (repeat == 1)
 
 
 def test_returns_unlike_the_papers_are_a_warning(release, small_release):
