@@ -96,8 +96,9 @@ class Score:
         return cls(float(returns.mean()), stderr, tuple(float(value) for value in returns), **others)
 
     def facts(self) -> dict[str, Any]:
-        """Everything but the pictures, as plain values."""
-        return {name: value for name, value in vars(self).items() if name != "pictures"}
+        """Everything but the pictures, as plain values; None instead of NaN, which JSON does not have."""
+        facts = {name: value for name, value in vars(self).items() if name != "pictures"}
+        return facts | {"stderr": None if math.isnan(self.stderr) else self.stderr}
 
 
 def evaluation_steps(task: Task, max_steps: int | None = None) -> int:

@@ -466,7 +466,7 @@ def test_a_maze_release_goes_through_b1_and_b3(small_mazes, tmp_path):
     command = ["validate", small_mazes, "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
     out = tmp_path / "out"
     result = invoke(*command, "--workers", 1, "--threads", 1, "--out", out, code=0)
-    facts = json.loads((out / "report.json").read_text())
+    facts = json.loads((out / "report.json").read_text(), parse_constant=pytest.fail)  # a goal's one episode: no NaN
     ran = [(r["cell"]["benchmark"], r["cell"]["agent"], r["labels"]["policy"]) for r in facts["results"]]
     assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | {
         ("b3", agent, f"random goal {pair}") for agent in ("bc", "id+bc") for pair in range(2)
