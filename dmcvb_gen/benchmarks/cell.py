@@ -469,7 +469,8 @@ def try_cell(
     except DmcvbError as error:
         return {"error": str(error)}
     except Exception as error:  # one cell's bug or lack of memory must not cost the hours of the others
-        write_text(log, traceback.format_exc())
+        with contextlib.suppress(OSError):  # of a full disk, about which the error is
+            write_text(log, traceback.format_exc())
         first = (str(error).splitlines() or [""])[0]
         return {"error": f"{type(error).__name__}: {first} (all of it in {log})"}
     log.unlink(missing_ok=True)

@@ -123,8 +123,8 @@ class Cell:
 
     @property
     def id(self) -> str:
-        """A file name, different for every cell of a release."""
-        parts = [self.benchmark, self.task, self.setting, self.agent.name, self.policy_label]
+        """A file name, different for every cell of a release, whose subsets' names leave out a maze's rows, too."""
+        parts = [self.benchmark, task_folder(self.task), self.setting, self.agent.name, self.policy_label]
         parts += ["from " + "+".join(part.label for part in self.pretrain)] if self.pretrain else []
         return "_".join(slug(part) for part in parts)
 

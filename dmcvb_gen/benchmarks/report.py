@@ -36,6 +36,7 @@ from dmcvb_gen.generate.info import return_statistics
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import is_maze, task_folder
+from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import pluralize
@@ -160,18 +161,24 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
         whose = "release {release}, profile {budget[name]}, seed {budget[seed]}".format(**there)
         raise DmcvbError(f"{out} holds results of {whose} (other {', '.join(sorted(names))}); give another --out")
     if training:
-        write_json(path, mine)
+        with storage_errors(folder, "write to"):
+            write_json(path, mine)
 
 
 # -- facts ------------------------------------------------------------------------------------------
 
 
 def write_report(folder: Path, facts: dict[str, Any], results: Results) -> Path:
-    """Write report.html and .json into a folder; gives the path of the page."""
+    """Write report.html and .json into a folder; gives the path of the page.
+
+    Raises:
+      StoreError: they cannot be written.
+    """
     page = folder / "report.html"
-    write_json(page.with_suffix(".json"), facts)
     good = [(cell, result) for cell, result in results if "error" not in result]
-    write_text(page, render_page(facts, good, folder))
+    with storage_errors(folder, "write to"):
+        write_json(page.with_suffix(".json"), facts)
+        write_text(page, render_page(facts, good, folder))
     return page
 
 

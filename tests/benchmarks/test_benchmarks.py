@@ -466,11 +466,17 @@ def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_releas
     def out_of_memory(*_, **__):
         raise MemoryError("no room for 7 GB")
 
+    def out_of_space(*_):
+        raise OSError("no space left")
+
     monkeypatch.setattr(cells_module, "load_data", out_of_memory)
     results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, budget, cells)}
     log = tmp_path / "cells" / f"{cells[1].id}.log"
     assert results["state-bc"]["error"] == f"MemoryError: no room for 7 GB (all of it in {log})"
     assert "out_of_memory" in log.read_text() and "--dino-weights" in results["dino+bc"]["error"]
+    monkeypatch.setattr(cells_module, "write_text", out_of_space)
+    results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, budget, cells)}
+    assert results["state-bc"]["error"].startswith("MemoryError")
     monkeypatch.undo()
     results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, budget, cells)}
     assert results["state-bc"]["score"]["mean"] >= 0 and not log.exists()

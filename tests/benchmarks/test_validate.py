@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import re
 import shutil
@@ -277,6 +278,16 @@ def test_a_folder_that_cannot_be_written_is_refused_before_any_work(release, tmp
     assert "choose another --out" in result.output
 
 
+@pytest.mark.parametrize("name, words", [("budget.json", ["--agents=state-bc"]), ("report.json", ["--checks-only"])])
+def test_a_full_disk_is_told_in_a_line(name, words, release, tmp_path, monkeypatch):
+    def full(path, value):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr("dmcvb_gen.benchmarks.report.write_json", full)
+    result = invoke("validate", release, *words, "--out", tmp_path / "out", code=2)
+    assert f"no room to write to {tmp_path / 'out' / name}" in result.output
+
+
 @pytest.mark.slow
 def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
     part = tmp_path / "part"
@@ -475,6 +486,7 @@ def test_a_maze_release_goes_through_b1_and_b3(small_mazes, tmp_path):
     pretrained = next(r for name, r in by_id.items() if name.startswith("b3") and "id-bc" in name.replace("+", "-"))
     assert [part["subset"] for part in pretrained["cell"]["pretrain"]] == [f"{MAZE}/hidden"]
     assert not facts["failed"] and not any(r["share"] for r in facts["results"])
+    assert (out / "cells" / "b1_ant-maze-tiny_visible_bc_random.json").exists()  # rows may be longer than a file's name
     assert "ant-maze-tiny/expert/visible" in result.output  # B1 would have the paper's levels too
     page, reached = (out / "report.html").read_text(), Release.open(small_mazes)[f"{MAZE}/visible"].read("terminated")
     [scored] = [r for r in facts["results"] if r["cell"]["agent"] == "state-bc"]
