@@ -91,7 +91,8 @@ def evaluation_of(release: Release, budget: Budget, cell: Cell) -> dict[str, Any
     """
     subset, pair = release[cell.policy[0].subset], cell.policy[0].goal_pair
     task = get_task(subset.task).at(subset.record.action_repeat)
-    facts = {"steps": evaluation_steps(task, budget.episode_steps), "goals": goal_cells(subset, pair)}
+    facts = {"task": subset.task, "steps": evaluation_steps(task, budget.episode_steps)}
+    facts["goals"] = goal_cells(subset, pair)
     if task.action_repeat != ACTION_REPEAT:
         facts["action_repeat"] = task.action_repeat
     if not cell.agent.sees_state:

@@ -36,7 +36,7 @@ from dmcvb_gen.policies.evaluation import goal_speed
 from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.spec import LEVELS, GoalMode, SubsetSpec, parse_setting
+from dmcvb_gen.spec import LEVELS, GoalMode, SubsetSpec, parse_setting, task_folder
 from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
 
 if TYPE_CHECKING:
@@ -341,7 +341,8 @@ def evaluate(
 
     All episodes run side by side, and the policy is asked for the actions of all of them at once. If it has attributes
     `stack`, `pixels` or `picture_size`, those are its own: other values are refused. A policy of `load_agent` has them;
-    if it learned from images of another renderer or from other videos than the evaluation's, a warning is logged.
+    if it learned another task, from images of another renderer or from other videos than the evaluation's, a warning
+    is logged.
 
     Args:
       policy: takes {"pixels": (episode, stack x view x 3, size, size) uint8, "state": (episode, state) float32} and
@@ -366,7 +367,7 @@ def evaluate(
 
     Raises:
       DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave their
-        bounds, or observations of another kind than the policy's.
+        bounds, or observations or actions of another kind or size than the policy's.
     """
     stack, pixels = _own_value(policy, "stack", stack, 3), _own_value(policy, "pixels", pixels, True)
     seen = getattr(policy, "evaluation", None) or {}
@@ -388,8 +389,9 @@ def evaluate(
     scene = replace(scene, **{name: value for name, value in given.items() if value is not None})
     limits = dict(episodes=episodes, seed=seed, max_steps=max_steps, threads=threads)
     with contextlib.closing(Evaluator(scene, pixels=pixels, stack=stack, **limits)) as evaluator:
-        if pixels and seen:
-            _tell_differences(scene, evaluator, seen)
+        if isinstance(policy, TrainedAgent):
+            _check_sizes(evaluator, policy)
+        _tell_differences(scene, evaluator, seen)
         score = evaluator.score(policy)
     if isinstance(where, Subset) and score.limit == where.record.max_steps:
         return replace(score, normalized=normalized(score.mean, reference_returns(where.release, where.record)))
@@ -409,13 +411,27 @@ def _own_value(policy: Act, name: str, given: Any, usual: Any) -> Any:
     return next(value for value in (own, given, usual) if value is not None)
 
 
+def _check_sizes(evaluator: Evaluator, policy: TrainedAgent) -> None:
+    """Raise DmcvbError if a trained policy's networks are made for other observations or actions."""
+    task, scene, shown = evaluator.task, evaluator.scene, {}
+    if policy.pixels:
+        shown = {"channels": 3 * len(scene.pictures.views) * policy.stack}
+    for name, size in {"state": task.state_size, "action": task.action_size, **shown}.items():
+        own = getattr(policy.sizes, name)
+        if own != size:
+            told = f"{name} has size {size} in {task_folder(scene.task)}, and the policy learned with {own}"
+            raise DmcvbError(f"{told}; evaluate it on the task that it learned")
+
+
 def _tell_differences(scene: EvaluationScene, evaluator: Evaluator, seen: Mapping[str, Any]) -> None:
-    """Log what an evaluation shows otherwise than the data that a trained policy learned from."""
-    here = {"renderer": {"name": scene.renderer, "samples": scene.samples}}
-    if scene.split == SPLIT and seen["backgrounds"] and evaluator.videos is not None:
+    """Log what an evaluation has otherwise than the data that a trained policy learned from."""
+    here: dict[str, Any] = {"task": scene.task}
+    if evaluator.renderer is not None:
+        here["renderer"] = {"name": scene.renderer, "samples": scene.samples}
+    if scene.split == SPLIT and seen.get("backgrounds") and evaluator.videos is not None:
         here["backgrounds"] = evaluator.videos.digest
     for name, value in here.items():
-        if value != seen[name]:
+        if value != seen.get(name, value):
             _log.warning("the policy's own evaluation has %s %s, this one %s", name, seen[name], value)
 
 

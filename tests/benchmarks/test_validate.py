@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import dmcvb_gen
 from dmcvb_gen.agents.data import Slice, load_data
 from dmcvb_gen.benchmarks.cell import data_score
 from dmcvb_gen.benchmarks.checks import (
@@ -28,6 +29,7 @@ from dmcvb_gen.benchmarks.checks import (
     check_structure,
     seen_warnings,
 )
+from dmcvb_gen.benchmarks.evaluate import load_agent
 from dmcvb_gen.benchmarks.plan import BUDGETS, goal_cells, only, plan_benchmark
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, _tables, curve_figures, render_page
 from dmcvb_gen.benchmarks.validate import validate
@@ -211,6 +213,15 @@ def test_the_report_shows_what_lies_in_its_folder(scored, tmp_path):
     (out / "cells" / "x.json").write_text("no result")
     scored([], out)
     assert agents_of(out) == ["state-bc"]
+
+
+def test_a_policy_is_not_evaluated_on_other_sizes_and_another_task_is_said(scored, caplog):
+    agent = load_agent(scored.first / "cells" / "b1_walker-walk_none_state-bc_random.safetensors")
+    with pytest.raises(DmcvbError, match="state has size 17 in cheetah-run, and the policy learned with 24"):
+        dmcvb_gen.evaluate(agent, "cheetah-run/none")
+    for task, told in (("walker-walk", []), ("walker-run", ["walker-walk, this one walker-run"])):
+        dmcvb_gen.evaluate(agent, f"{task}/none", episodes=1, max_steps=1)
+        assert [message.partition("has task ")[2] for message in caplog.messages] == told
 
 
 def test_another_release_or_budget_means_another_folder(scored, small_mazes, tmp_path):
