@@ -184,15 +184,19 @@ class CellRun:
         Raises:
           DmcvbError: the renderer cannot start, or training does not stay finite.
         """
-        encoder = self.cell.benchmark == ENCODER
         done = read_result(self.path(".json"), self.mark)
-        if done and (not encoder or self.path(".safetensors").exists()):
+        if done and (not self._keeps_weights or self.path(".safetensors").exists()):
             return done
-        made = self._pretrain() if encoder else self._train()
+        made = self._pretrain() if self.cell.benchmark == ENCODER else self._train()
         facts = {"id": self.cell.id, "fingerprint": self.mark, "cell": self.cell.facts()}
         facts |= {"budget": self.budget.facts() | {"note": self.budget.note}, **made}
         write_json(self.path(".json"), facts)
         return facts
+
+    @property
+    def _keeps_weights(self) -> bool:
+        """Encoders, and policies whose scores count; DINO's weights are a large file of the user's."""
+        return self.cell.benchmark == ENCODER or (self.budget.scores and not self.cell.agent.ready_encoder)
 
     @property
     def _subset(self) -> Subset:
@@ -255,7 +259,7 @@ class CellRun:
             cell.agent, data.sizes, policy, data.normalization, evaluation_of(self.release, budget, cell)
         )
         curve = self._train_policy(policy, trained, data)
-        if budget.scores and not cell.agent.ready_encoder:  # DINO's weights are a large file of the user's
+        if self._keeps_weights:
             trained.save(self.path(".safetensors"), budget.network)
         inspection = self.inspect(policy.encoder, data) if pixels and budget.readout_steps else None
         return self._facts(data, curve) | {

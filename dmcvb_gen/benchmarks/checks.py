@@ -190,7 +190,7 @@ def _check_subset(subset: Subset, tick: ProgressCallback) -> tuple[list[Issue], 
 
 def seen_warnings(release: Release, cells: Sequence[Cell], backgrounds: str | None) -> Iterator[Issue]:
     """Evaluation shows what no data show (paper, section 5); data that were painted with it do not tell."""
-    learned = dict.fromkeys(part.subset for cell in cells if not cell.agent.sees_state for part in cell.policy)
+    learned = dict.fromkeys(name for cell in cells if not cell.agent.sees_state for name in cell.subsets)
     for record in (release.subsets[name].record for name in learned):
         what, seen = "maze style", record.goal_mode is not None and record.split == SPLIT
         if record.backgrounds:

@@ -20,6 +20,7 @@ import pytest
 from PIL import Image
 
 import dmcvb_gen
+from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.data import Slice, load_data
 from dmcvb_gen.benchmarks.cell import data_score
 from dmcvb_gen.benchmarks.checks import (
@@ -30,7 +31,7 @@ from dmcvb_gen.benchmarks.checks import (
     seen_warnings,
 )
 from dmcvb_gen.benchmarks.evaluate import load_agent
-from dmcvb_gen.benchmarks.plan import BUDGETS, goal_cells, only, plan_benchmark
+from dmcvb_gen.benchmarks.plan import BUDGETS, Cell, goal_cells, only, plan_benchmark
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, _tables, curve_figures, render_page
 from dmcvb_gen.benchmarks.validate import validate
 from dmcvb_gen.cli.common import INTERRUPTED
@@ -204,6 +205,10 @@ def test_the_report_shows_what_lies_in_its_folder(scored, tmp_path):
     out = Path(shutil.copytree(scored.first, tmp_path / "out"))
     scored(["state-td3-bc"], out)
     assert agents_of(out) == ["state-td3-bc", "state-bc"]
+    [policy] = (out / "cells").glob("*state-td3-bc*.safetensors")
+    policy.unlink()
+    scored(["state-td3-bc"], out)
+    assert policy.exists()  # made again
     page = (out / "report.html").read_text()
     assert "state-bc" in page and "2 of 2 benchmark cells run" in page
     scored([], out)  # checks alone
@@ -390,6 +395,9 @@ def test_data_that_show_what_evaluation_shows_are_warned_of(tmp_path, small_rele
         cells, _ = plan_benchmark("b1", release, ["bc", "state-bc"])
         assert seen_in(release, cells) == {subset for subset in release.subsets if not subset.endswith("/none")}
         assert not seen_in(release, [cell for cell in cells if cell.agent.sees_state])
+    release, names = Release.open(tmp_path / "made" / "val"), ("walker-walk/random/none", "walker-walk/random/static")
+    cell = Cell("b2", "walker-walk", "none", parse_agent("id+bc"), *((Slice(name),) for name in names))
+    assert seen_in(release, [cell]) == {names[1]}  # its encoder's
     for folder in (small_release, maze_release):
         release = Release.open(folder)
         assert not seen_in(release, plan_benchmark("b1", release, ["bc"])[0])
