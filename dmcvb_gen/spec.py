@@ -163,7 +163,7 @@ class DistractorSetting:
         if self.kind not in DISTRACTOR_KINDS and self.kind not in distractor_kinds():
             raise UnknownNameError("distractor", self.kind, distractor_kinds())
         object.__setattr__(self, "difficulty", _canonical(self.difficulty))
-        if self.difficulty not in DIFFICULTIES and self.kind == "none":
+        if self.difficulty != "medium" and self.kind == "none":
             raise DmcvbError(f"distractor none has no difficulty; {self.difficulty} is for static or dynamic")
         if self.difficulty[0].isalpha() and self.difficulty not in DIFFICULTIES and self.kind not in DISTRACTOR_KINDS:
             raise DmcvbError(f"distractor {self.kind} has no parts such as {self.difficulty}; give a scale, e.g. 0.35")
@@ -239,7 +239,7 @@ def _strengths(difficulty: str) -> dict[str, float | None]:
         if not part or part in found or word == CUE:
             raise UnknownNameError("difficulty", difficulty, DIFFICULTIES)
         if part == "background":
-            if number not in ("", ALL) and not (number.isdigit() and int(number)):
+            if number not in ("", ALL) and not re.fullmatch("0*[1-9][0-9]{0,8}", number):
                 raise DmcvbError(
                     f"distractor part {word!r}: give a number of videos, e.g. background4, or background{ALL}"
                 )

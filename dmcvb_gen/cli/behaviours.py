@@ -162,7 +162,7 @@ def _converted(
       level: Level to note in the file.
       activation: Of hidden layers. [default: the program's]
       actions: Plain networks: how the output becomes an action in [-1, 1].
-      statistics (FILE): .npz with "mean" and "std" of normalized observations.
+      statistics (FILE): .npz with "mean" and "std" of normalized observations, in the policy's own order.
     """
     from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.bundled import CONVERTED
@@ -182,7 +182,7 @@ def convert_policy(as_json, progress, **options):
     """Convert another program's policy to a policy file: a Stable-Baselines3 zip or a torch state dict (CleanRL).
 
     Weights are read without unpickling anything. Data of a converted policy regenerate bit for bit. CleanRL's SAC keeps
-    its mean alone, and SB3's VecNormalize needs --statistics.
+    its mean alone; CleanRL's PPO and SB3's VecNormalize need --statistics.
 
     \b
     dmcvb-gen convert-policy model.zip walker-run --out walker-run.safetensors

@@ -207,7 +207,8 @@ def _read_pictures(path: Path) -> np.ndarray:
     with Image.open(path) as picture:
         if picture.width * picture.height > MAX_PIXELS:
             raise ValueError(f"{picture.width} x {picture.height} is more than {MAX_PIXELS:,} pixels")
-        frames = itertools.islice(ImageSequence.Iterator(picture), MAX_FRAMES)  # a hostile file has no end
+        most = 1 if path.suffix.lower() in PICTURES else MAX_FRAMES  # some photos hold two; a hostile file has no end
+        frames = itertools.islice(ImageSequence.Iterator(picture), most)
         return np.stack([square(_eight_bits(frame).convert("RGB")) for frame in frames])
 
 

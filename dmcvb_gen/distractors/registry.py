@@ -19,7 +19,7 @@ from dmcvb_gen.distractors.cue import Cue
 from dmcvb_gen.distractors.light import Light
 from dmcvb_gen.distractors.shake import Shake
 from dmcvb_gen.distractors.style import Style
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.spec import DISTRACTOR_ENTRY_POINTS, DISTRACTOR_KINDS, DistractorSetting, kind_of
 
 BUILT_IN: tuple[type[Distractor], ...] = (Camera, Color, Background, Style, Cue, Shake, Light)
@@ -37,6 +37,10 @@ def typed_setting(name: str) -> str:
         return name
     own, _, difficulty = rest.partition("_")
     own_code.refuse_file("distractor", name)
+    try:
+        DistractorSetting("static", difficulty or "medium")
+    except UnknownNameError as error:
+        raise DmcvbError(f"{name}: a difficulty follows an underscore, so classes have none; {error}") from None
     own_code.allow([f"{module}:{own}"], own_code.DISTRACTORS)
     distractors_of(DistractorSetting(own.lower()))
     return own.lower() + (f"_{difficulty}" if difficulty else "")

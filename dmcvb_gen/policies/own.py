@@ -52,8 +52,9 @@ class RowGenerator:
 class OwnPolicy(Policy):
     """A behaviour policy that is a function of the user's; the function draws its own noise, if it wants any.
 
-    Two known observations are shown to it again before its calls number 1, 2, 4, 8 and so on, in another order and
-    alone: an action must follow from its row alone, not from calls before it, the clock or its neighbors.
+    Two known observations are shown to it again before its calls number 1, 2, 4, ... 64, 128, 192 and so on, and after
+    the last, in another order and alone: an action must follow from its row alone, not from calls before it, the clock
+    or its neighbors.
 
     Args:
       seen: (2, observation) float32, these observations.
@@ -76,12 +77,12 @@ class OwnPolicy(Policy):
         self._name, self._function, self._bounds = name, function, (task.action_low, task.action_high)
         self._seen, self._calls = seen, 0
         self._known = self._probe(PROBES[0])
-        self._check()
+        self.check()
 
     def _probe(self, rows: Sequence[int]) -> np.ndarray:
         return self._ask(self._seen[rows], [np.random.default_rng(row) for row in rows])
 
-    def _check(self) -> None:
+    def check(self) -> None:
         for rows in PROBES:
             if not np.allclose(self._probe(rows), self._known[rows], atol=ROUNDING):
                 raise PolicyFileError(
@@ -91,8 +92,8 @@ class OwnPolicy(Policy):
 
     def act(self, observation, generators=None, deterministic=False):
         self._calls += 1
-        if self._calls.bit_count() == 1:
-            self._check()
+        if self._calls.bit_count() == 1 or self._calls % 64 == 0:
+            self.check()
         return self._ask(observation, generators or ())
 
     def _ask(self, observation: np.ndarray, generators: Sequence[np.random.Generator]) -> np.ndarray:

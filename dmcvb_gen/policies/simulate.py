@@ -161,6 +161,8 @@ def simulate(
             _check_finite(task, part)
         except EpisodeError as error:
             raise error.of_episode(int(part.episodes[error.place])) from error
+    for policy in policies:
+        policy.check()
     return out
 
 

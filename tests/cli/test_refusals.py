@@ -30,6 +30,8 @@ ROLLOUTS = [
     ("walker-walk --distractor dis:Base", "dis.py has no 'Base'; if that is not your file, rename yours"),
     ("walker-walk --distractor a/mine.py:Base_hard", "is a file; in its folder, give mine:Base_hard"),
     ("walker-walk --distractor math:pi_hard", "is no distractor 'pi'"),
+    ("walker-walk --distractor fog:My_Fog", "unknown difficulty 'Fog'"),
+    ("walker-walk --distractor fog:My_Fog", "a difficulty follows an underscore, so classes have none"),
     ("walker-walk --size 0", "8 to 1024"),
     ("walker-walk --samples 3", "'--samples': '3' is not one of"),
     ("walker-walk --max-steps 99999999999", "--max-steps is 99999999999: Input should be less than or equal to 5000"),

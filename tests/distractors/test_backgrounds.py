@@ -119,6 +119,13 @@ def test_a_video_keeps_its_colors_order_and_central_square(tmp_path):
         np.testing.assert_allclose(found[index].mean((0, 1)), [40 * index, 200 - 40 * index, 90], atol=6)
 
 
+def test_a_picture_is_one_frame_even_if_its_file_holds_more(tmp_path):
+    pictures = [Image.fromarray(frame) for frame in clip(3)]
+    pictures[0].save(tmp_path / "photo.jpg", "MPO", save_all=True, append_images=pictures[1:])
+    pictures[0].save(tmp_path / "zoom.png", save_all=True, append_images=pictures[1:])
+    assert [load_backgrounds(tmp_path, split).lengths for split in ("train", "val")] == [(1,), (1,)]
+
+
 def test_numbers_in_names_are_ordered_by_value_and_hidden_files_passed_over(tmp_path):
     write_frames(tmp_path / "walk", [np.full((20, 20, 3), 20 * index, np.uint8) for index in range(12)], "png")
     (tmp_path / "walk" / "._0.png").write_bytes(b"left by another system")

@@ -49,7 +49,8 @@ def test_a_setting_says_what_varies_and_how_much():
     [
         *("dynamic_0", "dynamic_1.01", "dynamic_nan", "dynamic_-0.1", "dynamic_camera2", "dynamic_camera0"),
         *("dynamic_background0", "dynamic_background1.5", "dynamic_0.0001", "static_cue0.5", "dynamic_cue0"),
-        *("dynamic_cue1.5", "dynamic_cue", "dynamic_cue0.5-cue1", "dynamic_"),
+        *("dynamic_cue1.5", "dynamic_cue", "dynamic_cue0.5-cue1", "dynamic_", "none_easy", "none_hard", "none_camera"),
+        *("dynamic_background\u00b2", "dynamic_background" + "9" * 5000),
     ],
 )
 def test_numbers_out_of_range_and_cues_that_cannot_be_are_refused(name):

@@ -26,7 +26,9 @@ from dmcvb_gen.own_code import BEHAVIOURS, allow, find_function
 from dmcvb_gen.own_code import TASKS as TASKS_VARIABLE
 from dmcvb_gen.policies.bundled import level_files, resolve_policies
 from dmcvb_gen.policies.convert import convert
+from dmcvb_gen.policies.own import own_policy
 from dmcvb_gen.policies.policy_file import load_policy, save_policy
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.release.card import write_card
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks import get_task
@@ -48,7 +50,7 @@ def narrow(observations, generator):
 def broken(observations, generator):
     raise KeyError("no such thing")
 
-calls = []
+calls, TURN = [], 10**9
 
 def count(observations):
     calls.append(len(observations))
@@ -59,6 +61,9 @@ def counting(observations, generator):
 
 def held(observations, generator):
     return np.full((len(observations), {actions}), count(observations) // 16 % 2)
+
+def turning(observations, generator):
+    return np.full((len(observations), {actions}), float(count(observations) > TURN))
 
 def unseeded(observations, generator):
     return np.random.default_rng().uniform(size=(len(observations), {actions}))
@@ -195,6 +200,15 @@ def test_functions_that_give_no_actions_are_refused_in_one_line(task, code, tmp_
     assert (tmp_path / "r").exists() == (function == "held")  # which changes in a later call
 
 
+def test_a_function_that_turns_in_its_last_call_is_refused_before_its_shard_is_written(task, code):
+    allow([f"{code}:turning"], BEHAVIOURS)
+    policy, module = own_policy(f"{code}:turning", task), sys.modules[code]
+    module.TURN = len(module.calls) + 12  # of 4 steps, the 3 probes before the first, second and fourth
+    with pytest.raises(DmcvbError, match="turning gave other actions for the same observation"):
+        simulate(task, [policy], [0, 1], 0, ("a", "b"), max_steps=4)
+    assert len(module.calls) > module.TURN
+
+
 # -- Stable-Baselines3 ----------------------------------------------------------------------------
 
 SB3 = {
@@ -219,8 +233,15 @@ def test_an_sb3_policy_acts_as_sb3_does(task_id, name, named, tmp_path):
     for parameter in made.policy.parameters():
         parameter.data *= 100 if name == "ppo" else 4  # so that some actions are at the bounds
     made.save(tmp_path / "model.zip")
-    save_policy(tmp_path / "p.safetensors", *convert(tmp_path / "model.zip", task.id))
-    theirs, _ = made.predict(parts, deterministic=True)
+    statistics, given = None, parts
+    if named:
+        mean = {field: np.linspace(index, 3, part.shape[1]) for index, (field, part) in enumerate(parts.items())}
+        order, statistics = list(made.observation_space.spaces), tmp_path / "seen.npz"
+        joined = np.concatenate([mean[field] for field in order])
+        np.savez(statistics, mean=joined, std=1 + joined)
+        given = {field: ((part - mean[field]) / (1 + mean[field])).astype(np.float32) for field, part in parts.items()}
+    save_policy(tmp_path / "p.safetensors", *convert(tmp_path / "model.zip", task.id, statistics=statistics))
+    theirs, _ = made.predict(given, deterministic=True)
     ours = task.from_unit(load_policy(tmp_path / "p.safetensors").act(seen, None, True))
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
     if task_id == "quadruped-walk" and not named:
@@ -243,14 +264,14 @@ class Doubled(FlattenExtractor):
         (CrossQ, {}, {}, "'actor.latent_pi.0.scale', which is no part of a plain MLP"),
         (RecurrentPPO, {"n_steps": 8, "batch_size": 8}, {}, "a recurrent part (LSTM)"),
         (SAC, {}, {"fields": {"a": 12, "b": 12}}, "observes {'a': 12, 'b': 12}, walker-walk shows {'orientations': 14"),
-        (SAC, {}, {}, "VecNormalize"),
+        (SAC, {}, {}, "VecNormalize, whose numbers are not in it; run `dmcvb-gen convert-policy"),
     ],
 )
 def test_what_is_not_a_plain_mlp_on_the_tasks_own_spaces_is_refused_and_named(
     algorithm, kwargs, space, words, tmp_path
 ):
     made = model(algorithm, Space(get_task(WALKER), **space), **kwargs)
-    if words == "VecNormalize":
+    if "VecNormalize" in words:
         made._last_original_obs = np.zeros((1, 24), np.float32)  # as SB3 keeps it behind VecNormalize
     made.save(tmp_path / "model.zip")
     assert words in refused("convert-policy", tmp_path / "model.zip", WALKER, "--out", tmp_path / "p.safetensors")
@@ -344,6 +365,12 @@ def test_a_cleanrl_state_dict_acts_as_cleanrl_does(task, kind, name, wrapper, tm
     np.testing.assert_allclose(load_policy(tmp_path / "p.safetensors").act(seen, None, True), theirs, atol=1e-5)
 
 
+def test_cleanrls_ppo_needs_the_statistics_that_it_normalized_with(tmp_path):
+    torch.save(CleanRlPpo(24, 6).state_dict(), tmp_path / "actor.pt")
+    with pytest.raises(DmcvbError, match=r"behind CleanRL's NormalizeObservation.*--statistics FILE"):
+        convert(tmp_path / "actor.pt", WALKER)
+
+
 def test_a_file_that_was_written_anew_is_read_anew(task, tmp_path):
     path, releases = tmp_path / "actor.pt", []
     for seed in range(2):
@@ -413,7 +440,8 @@ def test_files_that_make_no_policy_are_refused_and_change_no_file(plain, name, s
 
 
 def test_a_plain_network_says_neither_activation_nor_actions(plain, tmp_path):
-    assert "give --activation and --actions" in refused(*plain[:3], "--out", tmp_path / "p.safetensors")
+    refusal = refused("rollout", WALKER, *TINY, "--behaviour", plain[1], "--out", tmp_path / "r")
+    assert f"run `dmcvb-gen convert-policy {plain[1]} {WALKER} --out NEW.safetensors --activation" in refusal
 
 
 @pytest.mark.parametrize(
