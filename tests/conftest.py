@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import functools
+import gc
 import json
 import os
 import shutil
@@ -23,13 +26,28 @@ from dmcvb_gen.dataset.writer import finish, put_shard  # noqa: E402
 from dmcvb_gen.generate.executors import run_works  # noqa: E402
 from dmcvb_gen.generate.plan import make_plan, start  # noqa: E402
 from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
+from dmcvb_gen.generate.renderer_choice import default_renderer  # noqa: E402
 from dmcvb_gen.release.verify import verify_folder  # noqa: E402
 from dmcvb_gen.rendering.native import textures  # noqa: E402
+from dmcvb_gen.tasks import get_task  # noqa: E402
+from dmcvb_gen.tasks.ant_maze.arena import textured_model  # noqa: E402
 
 pytest_plugins = ["tests.compiled_code", "tests.tiers"]
 
 # Tests make hundreds of renderers of mazes in one process, with more textures than a command needs to keep.
 textures._packed_levels = functools.lru_cache(maxsize=64)(textures._packed_levels.__wrapped__)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Give memory back after each file of tests: one process meets more tasks than a command ever does."""
+    if nextitem is not None and nextitem.path == item.path:
+        return
+    for cache in (get_task, default_renderer, textured_model, textures._packed_levels):
+        cache.cache_clear()
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # glibc alone has it
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 WALKERS = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "static", "dynamic"]}
