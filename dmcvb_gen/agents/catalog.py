@@ -15,7 +15,8 @@ from pathlib import Path
 from torch import nn
 
 from dmcvb_gen.agents.data import FRAMES, Sizes
-from dmcvb_gen.agents.learners import PARTS, Learner, Policy, ReadyEncoder
+from dmcvb_gen.agents.dino import DinoEncoder
+from dmcvb_gen.agents.learners import PARTS, Learner, Policy
 from dmcvb_gen.agents.networks import PAPER, Architecture, Encoder, observation_encoder, state_encoder
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.own_code import source_digest
@@ -27,7 +28,7 @@ MOST = 64
 def agent_names() -> tuple[str, ...]:
     """The names that `parse_agent` takes, options left out."""
     own = [name for name, part in PARTS.all().items() if issubclass(part, Policy)]
-    encoders = [name for name, part in PARTS.all().items() if issubclass(part, ReadyEncoder) or part.pretrains]
+    encoders = [name for name, part in PARTS.all().items() if part.pretrains]
     return (*own, *(f"state-{name}" for name in own), *(f"{encoder}+{name}" for name in own for encoder in encoders))
 
 
@@ -72,10 +73,9 @@ class Agent:
         return f"{self.pretrain or 'null'}+{self.policy}"
 
     @property
-    def ready_encoder(self) -> type[ReadyEncoder] | None:
-        """The class of its encoder, if that comes trained from a file."""
-        part = PARTS.get(self.pretrain) if self.pretrain else None
-        return part if part is not None and issubclass(part, ReadyEncoder) else None
+    def sees_by_dino(self) -> bool:
+        """True if its encoder comes trained from a file."""
+        return self.pretrain == "dino"
 
     @property
     def pretraining(self) -> Agent:
@@ -145,12 +145,12 @@ def make_encoder(
     """phi of an agent, untrained, or of a file of weights.
 
     Raises:
-      DmcvbError: weights are asked for and not at hand.
+      DmcvbError: the file holds others.
     """
     if agent.sees_state:
         return state_encoder(sizes.state)
-    if agent.ready_encoder:
-        return agent.ready_encoder.load(weights, sizes.channels, sizes.picture)
+    if agent.sees_by_dino:
+        return DinoEncoder.load(weights, sizes.channels, sizes.picture)
     return observation_encoder(sizes.channels, sizes.picture, architecture, sizes.stack)
 
 

@@ -44,7 +44,7 @@ class Slice:
     """A part of a subset, by name.
 
     Attributes:
-      share: share of its episodes, drawn by the seed of the split.
+      share: share of its episodes, at least one, drawn by the seed of the split.
       episodes: so many of its episodes instead.
       goal_pair: only episodes of this fixed (start, goal) pair (mazes).
     """
@@ -397,11 +397,6 @@ def batches(
             yield step, batch
 
 
-def part_count(share: float, episodes: int) -> int:
-    """Return the number of episodes in a share of them, at least one."""
-    return max(1, round(share * episodes))
-
-
 def choose_episodes(subset: Subset, part: Slice, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """(episodes, held out) of a slice of a subset, and which of those no agent learns from.
 
@@ -413,7 +408,7 @@ def choose_episodes(subset: Subset, part: Slice, seed: int) -> tuple[np.ndarray,
         names = names[subset.read("goal_pair") == part.goal_pair]
         if not len(names):
             raise DmcvbError(f"{subset.name} has no episodes of goal pair {part.goal_pair}")
-    count = min(part.episodes or part_count(part.share, len(names)), len(names))
+    count = min(part.episodes or max(1, round(part.share * len(names))), len(names))
     chosen = np.random.default_rng(seed).permutation(len(names))[:count]
     few = part.episodes is not None or part.goal_pair is not None
     held_out = 0 if few else min(math.ceil(HOLD_OUT * count), count - 1)

@@ -6,6 +6,7 @@ of the weights' shapes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -13,9 +14,10 @@ import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
 from torch import nn
 
-from dmcvb_gen.agents.learners import ReadyEncoder, register_agent
+from dmcvb_gen.agents.learners import register_agent
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.extras import install_hint
+from dmcvb_gen.files import sha256_file
 
 INPUT = 224
 """Pixels a side that DINO was trained on; smaller pictures are padded (paper, section 4.2)."""
@@ -25,12 +27,14 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 @register_agent("dino")
-class DinoEncoder(ReadyEncoder):
+class DinoEncoder(nn.Module):
     """(batch, 3 x pictures, size, size) in [-0.5, 0.5] -> (batch, width x pictures).
 
     Every picture of the stack is padded with grey to 224 x 224 and encoded by itself, to its normalized class token.
     """
 
+    options: Mapping[str, int | bool] = {}
+    pretrains = True
     missing = (
         "the agent 'dino' needs the weights of a DINO vision transformer, which dmcvb-gen never downloads: give "
         "--dino-weights PATH, a safetensors file (for example timm's vit_small_patch16_224.dino, model.safetensors)"
@@ -49,9 +53,26 @@ class DinoEncoder(ReadyEncoder):
         return self.vit((pictures + 0.5 - self.mean) / self.std).reshape(len(observation), -1)
 
     @classmethod
-    def load(cls, weights: str | Path | None, channels: int, size: int = 64) -> DinoEncoder:
+    def digest(cls, weights: str | Path | None) -> str:
+        """SHA-256 of the file of weights.
+
+        Raises:
+          DmcvbError: no file is given, or it cannot be read.
+        """
         if weights is None:
             raise DmcvbError(cls.missing)
+        try:
+            return sha256_file(weights)
+        except OSError as error:
+            raise DmcvbError(f"cannot read weights {weights} ({error}); give a safetensors file") from None
+
+    @classmethod
+    def load(cls, weights: str | Path, channels: int, size: int = 64) -> DinoEncoder:
+        """The encoder of observations with so many channels, of pictures with so many pixels a side.
+
+        Raises:
+          DmcvbError: the file does not hold such weights.
+        """
         if size > INPUT:
             raise DmcvbError(f"DINO sees {INPUT} pixels a side at most, these images have {size}; repaint them smaller")
         if Path(weights).suffix != ".safetensors":  # timm unpickles files of other names
@@ -71,8 +92,6 @@ def _sizes(weights: str | Path) -> dict[str, float]:
     """timm's arguments for a network of the shapes in a file."""
     with safe_open(str(weights), "pt") as file:
         shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118 (not a dict)
-    if "patch_embed.proj.weight" not in shapes or "blocks.0.mlp.fc1.weight" not in shapes:
-        raise ValueError("no patch_embed.proj.weight and blocks.0.mlp.fc1.weight")
     width, _, patch, _ = shapes["patch_embed.proj.weight"]
     depth = 1 + max(int(name.split(".")[1]) for name in shapes if name.startswith("blocks."))
     ratio, classes = shapes["blocks.0.mlp.fc1.weight"][0] / width, shapes.get("head.weight", [0])[0]

@@ -13,14 +13,12 @@ import functools
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from torch import nn
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import sha256_file
 from dmcvb_gen.registry import Registry
 
 EMA_DECAY = 0.99
@@ -154,51 +152,15 @@ class Policy(Learner):
         return not weight.startswith(self.only_learns)
 
 
-class ReadyEncoder(nn.Module, abc.ABC):
-    """An encoder that is trained already: its weights are a file of the user's.
-
-    Attributes:
-      features: width of its output.
-      missing: what to say if no file is given.
-    """
-
-    options: Mapping[str, int | bool] = {}
-    features: int
-    missing: str
-
-    @classmethod
-    @abc.abstractmethod
-    def load(cls, weights: str | Path | None, channels: int, size: int) -> ReadyEncoder:
-        """The encoder of observations with so many channels, of pictures with so many pixels a side.
-
-        Raises:
-          DmcvbError: no file is given, or it does not hold such weights.
-        """
-
-    @classmethod
-    def digest(cls, weights: str | Path | None) -> str:
-        """SHA-256 of the file of weights.
-
-        Raises:
-          DmcvbError: no file is given, or it cannot be read.
-        """
-        if weights is None:
-            raise DmcvbError(cls.missing)
-        try:
-            return sha256_file(weights)
-        except OSError as error:
-            raise DmcvbError(f"cannot read weights {weights} ({error}); give a safetensors file") from None
-
-
-Part = TypeVar("Part", bound=type[Learner] | type[ReadyEncoder])
-PARTS: Registry[type[Learner] | type[ReadyEncoder]] = Registry("agent", "dmcvb_gen.agents", "dmcvb_gen.agents")
+Part = TypeVar("Part", bound=type[nn.Module])
+PARTS: Registry[Any] = Registry("agent", "dmcvb_gen.agents", "dmcvb_gen.agents")
 
 
 def register_agent(name: str) -> Callable[[Part], Part]:
     """Class decorator that makes a part of agents known by name.
 
-    A `Policy` gives the agents "NAME" and "state-NAME", and "PRETRAIN+NAME" with every encoder; another `Learner` or a
-    `ReadyEncoder` pre-trains an encoder, as in "NAME+bc".
+    A `Policy` gives the agents "NAME" and "state-NAME", and "PRETRAIN+NAME" with every encoder; another `Learner`
+    pre-trains an encoder, as in "NAME+bc".
 
     Raises:
       ValueError: the name is no plain word, or begins as those of agents that see states do.

@@ -32,6 +32,7 @@ from torch import nn
 
 from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pretrainer
 from dmcvb_gen.agents.data import TrainingData, default_memory, labeled_episodes, load_data
+from dmcvb_gen.agents.dino import DinoEncoder
 from dmcvb_gen.agents.learners import Learner, Policy
 from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
 from dmcvb_gen.agents.probe import action_probe
@@ -116,8 +117,8 @@ def fingerprint(release: Release, budget: Budget, cell: Cell) -> str:
         facts["budget"].pop("precision")
     if cell.benchmark != ENCODER:
         facts["evaluation"] = evaluation_of(release, budget, cell)
-        if agent.ready_encoder:
-            facts["weights"] = agent.ready_encoder.digest(budget.dino_weights)
+        if agent.sees_by_dino:
+            facts["weights"] = DinoEncoder.digest(budget.dino_weights)
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
@@ -196,7 +197,7 @@ class CellRun:
     @property
     def _keeps_weights(self) -> bool:
         """Encoders, and policies whose scores count; DINO's weights are a large file of the user's."""
-        return self.cell.benchmark == ENCODER or (self.budget.scores and not self.cell.agent.ready_encoder)
+        return self.cell.benchmark == ENCODER or (self.budget.scores and not self.cell.agent.sees_by_dino)
 
     @property
     def _subset(self) -> Subset:

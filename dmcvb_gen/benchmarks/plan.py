@@ -1,23 +1,22 @@
 """What is trained: a release's subsets enter, the cells of benchmarks and the budgets of their trainings leave.
 
-A benchmark registers itself by name; `plan_benchmark` gives the cells of one. B1, B2, B3 and the ablations are the
-paper's sections 5.1 to 5.3 and its appendix.
+A benchmark registers itself by name; `plan_benchmark` gives the cells of one. B1, B2 and B3 are the paper's sections
+5.1 to 5.3.
 """
 
 from __future__ import annotations
 
 import abc
 import copy
-import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from dmcvb_gen.agents.catalog import Agent, parse_agent
-from dmcvb_gen.agents.data import Slice, part_count
+from dmcvb_gen.agents.data import Slice
 from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
@@ -159,7 +158,7 @@ class Cell:
     @property
     def encoder(self) -> Cell | None:
         """The cell of its encoder's pre-training; None if it is trained with the policy, or comes from a file."""
-        if self.benchmark == ENCODER or self.agent.pretrain is None or self.agent.ready_encoder:
+        if self.benchmark == ENCODER or self.agent.pretrain is None or self.agent.sees_by_dino:
             return None
         parts = self.pretrain or self.policy
         labels = self.policy if PARTS.get(self.agent.pretrain).needs_labels else ()
@@ -224,26 +223,13 @@ class SubsetFinder:
         """Levels that there are of a task and setting, best first."""
         return [level for level in LEVELS if (task, level, setting) in self._names]
 
-    def find(self, task: str, levels: Iterable[str], setting: str) -> tuple[str, ...] | None:
-        """Names of the subsets, or None if one is missing (which is then noted)."""
+    def parts(self, task: str, levels: Iterable[str], setting: str) -> tuple[Slice, ...] | None:
+        """All of these subsets, or None if one is missing (which is then noted)."""
         lacking = [(level, setting) for level in levels if (task, level, setting) not in self._names]
         if lacking:
             self._asked.setdefault(task, []).extend(lacking)
             return None
-        return tuple(self._names[task, level, setting] for level in levels)
-
-    def parts(self, task: str, levels: Iterable[str], setting: str) -> tuple[Slice, ...] | None:
-        """All of these subsets, or None (see `find`)."""
-        names = self.find(task, levels, setting)
-        return names and tuple(map(Slice, names))
-
-    def experts(self) -> Iterator[tuple[str, str, str, int]]:
-        """(task, setting, name, number of episodes) of every expert subset; of mazes, where goals are visible."""
-        for task in self.tasks:
-            for setting in [VISIBLE] if is_maze(task) else self.settings(task):
-                names = self.find(task, ["expert"], setting)
-                if names:
-                    yield task, setting, names[0], len(self.release[names[0]].episodes)
+        return tuple(Slice(self._names[task, level, setting]) for level in levels)
 
     def missing(self, benchmark: str) -> list[Missing]:
         """Requests that nothing in the release fits, by task."""
@@ -333,21 +319,17 @@ class Benchmark(abc.ABC):
         return None
 
     def reference(self, cell: Cell) -> str:
-        """Name what a cell's score is compared with; by default the paper's appendix "Dataset size study"."""
-        return f"BC on all of expert/{_whole_setting(cell)}"
+        """Name what a cell's score is compared with; by default what the paper's section 5.2 has."""
+        return "BC on all of expert/none"
 
     def is_reference(self, other: Cell, cell: Cell) -> bool:
         """Return True if another cell of the same task is that reference."""
-        return (other.setting, other.agent.name, other.policy_label) == (_whole_setting(cell), "bc", "expert")
+        return (other.setting, other.agent.name, other.policy_label) == ("none", "bc", "expert")
 
     def group(self, cell: Cell) -> tuple[str, str] | None:
         """(mazes, policy learns from) of the maze cells that the report takes the mean of; None: of others."""
         row = paper_task(cell.task)
         return (row, cell.policy_label) if row in MAZE_GROUPS.values() else None
-
-
-def _whole_setting(cell: Cell) -> str:
-    return VISIBLE if is_maze(cell.task) else DISTRACTOR_KINDS[0]
 
 
 BENCHMARKS: Registry[Benchmark] = Registry("benchmark", "dmcvb_gen.benchmarks.plan", "dmcvb_gen.benchmarks")
@@ -443,11 +425,11 @@ class FewEpisodes(Benchmark):
             if full:
                 yield Cell(self.name, task, "none", bc, full)  # scores are shares of this one
             for setting in data.settings(task):
-                expert, mixed = data.find(task, ["expert"], setting), data.parts(task, ["mixed"], setting)
+                expert, mixed = (data.parts(task, [level], setting) for level in ("expert", "mixed"))
                 if not expert:
                     continue
-                there = len(data.release[expert[0]].episodes)
-                few = (Slice(expert[0], episodes=min(self.few, there)),)
+                there = len(data.release[expert[0].subset].episodes)
+                few = (replace(expert[0], episodes=min(self.few, there)),)
                 yield Cell(self.name, task, setting, bc, few)
                 if mixed:
                     yield Cell(self.name, task, setting, bc, few + mixed)
@@ -467,9 +449,9 @@ class FixedGoals(Benchmark):
         mazes = [task for task in data.tasks if is_maze(task)]
         for task in mazes or [f"{ANT_MAZE}-empty7x7"]:
             for level in data.levels(task, FIXED) or ["expert"]:
-                fixed, hidden = data.find(task, [level], FIXED), data.parts(task, [level], HIDDEN)
-                for pair in goal_pairs(data.release[fixed[0]]) if fixed else ():
-                    ten = (Slice(fixed[0], goal_pair=pair),)
+                fixed, hidden = (data.parts(task, [level], setting) for setting in (FIXED, HIDDEN))
+                for pair in goal_pairs(data.release[fixed[0].subset]) if fixed else ():
+                    ten = (replace(fixed[0], goal_pair=pair),)
                     yield Cell(self.name, task, FIXED, parse_agent("bc"), ten)
                     for agent in agents if hidden else ():
                         yield Cell(self.name, task, FIXED, agent, ten, hidden)
@@ -482,26 +464,6 @@ class FixedGoals(Benchmark):
 
     def group(self, cell):
         return task_folder(cell.task), cell.policy_label.partition(" goal ")[0]
-
-
-@register_benchmark("ablations")
-class Ablations(Benchmark):
-    """Agents on expert data, and BC on shares of it; beside BC on all of expert/none (appendix)."""
-
-    title = "Ablations"
-    # Inverse dynamics over more steps stand beside pre-training by BC, which the paper sees them tend to.
-    agents = ("bc:frames=1", "bc", "bc+bc", "id+bc", "id+bc:k=5", "id+bc:k=10", "id+bc:k=10:sample")
-    shares = (0.01, 0.05, 0.1, 0.25, 0.5)
-
-    def cells(self, data, agents):
-        for task, setting, name, there in data.experts():
-            for agent in agents:
-                yield Cell(self.name, task, setting, agent, (Slice(name),))
-            by_pictures = [agent for agent in agents if agent.name == "bc"]
-            counts = {part_count(share, there): share for share in self.shares}  # one share of equal counts
-            shares = [share for count, share in counts.items() if count < there]
-            for share, agent in itertools.product(shares, by_pictures):
-                yield Cell(self.name, task, setting, agent, (Slice(name, share=share),))
 
 
 @register_benchmark("b4")
@@ -519,11 +481,15 @@ class LabelBudgets(Benchmark):
 
     def cells(self, data, agents):
         bc = parse_agent("bc")
-        for task, setting, name, there in data.experts():
-            whole = (Slice(name),)
+        places = ((task, s) for task in data.tasks for s in ([VISIBLE] if is_maze(task) else data.settings(task)))
+        for task, setting in places:
+            whole = data.parts(task, ["expert"], setting)
+            if not whole:
+                continue
             yield Cell(self.name, task, setting, bc, whole)  # scores are shares of this one
+            there = len(data.release[whole[0].subset].episodes)
             for budget in [budget for budget in self.budgets if budget < there]:
-                labeled = (Slice(name, episodes=budget),)
+                labeled = (replace(whole[0], episodes=budget),)
                 yield Cell(self.name, task, setting, bc, labeled)
                 for agent in agents:
                     yield Cell(self.name, task, setting, agent, labeled, whole)

@@ -78,18 +78,20 @@ class Validation:
     Attributes:
       structure: result of the structure checks.
       results: (cell, result) of every cell that was asked for; a result of {"error": ...} failed.
-      missing: subsets that the benchmarks would need besides.
-      episodes: committed, and asked for by the manifest.
-      report: the page. facts: the JSON file beside it.
+      complete: True if every episode is there.
+      report: the page.
     """
 
     structure: Structure
     results: tuple[tuple[Cell, dict[str, Any]], ...]
-    missing: tuple[Missing, ...]
     warnings: tuple[Issue, ...]
-    episodes: tuple[int, int]
+    complete: bool
     report: Path
-    facts: Path
+
+    @property
+    def facts(self) -> Path:
+        """The JSON file beside the page."""
+        return self.report.with_suffix(".json")
 
     @property
     def failed(self) -> tuple[tuple[Cell, str], ...]:
@@ -99,11 +101,6 @@ class Validation:
     def sound(self) -> bool:
         """True if the release is sound and every cell could be run."""
         return self.structure.sound and not self.failed
-
-    @property
-    def complete(self) -> bool:
-        """True if every episode is there."""
-        return self.episodes[0] == self.episodes[1]
 
 
 def plan_validation(
@@ -322,7 +319,7 @@ def render_page(facts: dict[str, Any], good: Results, folder: Path) -> str:
 
 def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
     return dict(
-        verdict=_verdict(facts),
+        verdict=verdict(facts),
         checks=_checks(facts["structure"]["findings"]),
         incomplete=[(name, *counts) for name, counts in facts["incomplete"].items()],
         findings=_listed(facts["structure"]["findings"]),
@@ -337,7 +334,8 @@ def _tables(facts: Mapping[str, Any]) -> dict[str, Any]:
     )
 
 
-def _verdict(facts: Mapping[str, Any]) -> dict[str, str]:
+def verdict(facts: Mapping[str, Any]) -> dict[str, str]:
+    """How a validation went, in a line: its kind (sound, incomplete, unsound) and its text."""
     checked = ", ".join(pluralize(count, what) for what, count in facts["structure"]["checked"].items())
     if facts["sound"]:
         text = f"All checks passed ({checked})."
@@ -366,16 +364,11 @@ def _listed(findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _returns(returns: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """A row for the settings of a task and level whose returns are the same, as those of shared trajectories are."""
-    alike: dict[tuple, list[str]] = {}
-    for name, values in returns.items():
-        place, _, setting = name.rpartition("/")
-        paper = values["paper"] and tuple(values["paper"][key] for key in STATISTICS)
-        alike.setdefault((place, tuple(values[key] for key in STATISTICS), paper), []).append(setting)
     rows = []
-    for (place, ours, paper), settings in alike.items():
-        found = [(f"{place}/{', '.join(settings)}", ours), *([(f"the paper's {place}", paper)] if paper else [])]
-        rows += [[name, *(f"{value:.1f}" for value in values)] for name, values in found]
+    for name, ours in returns.items():
+        for label, values in ((name, ours), ("the paper's", ours["paper"])):
+            if values:
+                rows.append([label, *(f"{values[key]:.1f}" for key in STATISTICS)])
     return {"head": ("subset", *STATISTICS), "rows": rows}
 
 

@@ -57,7 +57,7 @@ def validate(
       release (RELEASE): Folder of the release.
       profile: Budget: smoke (no scores), brief, quick or paper.
       scale: Multiply the profile's steps.
-      benchmarks: b1, b2, b3, b4, ablations.
+      benchmarks: b1, b2, b3, b4.
       agents (A,B): Agents to train, e.g. bc,state-bc,id+bc. [default: the benchmark's]
       only (PATTERN): Use only these subsets, e.g. 'walker-walk/expert/*'.
       out (FOLDER): Folder of the report. [default: reports/NAME]
@@ -117,9 +117,7 @@ def validate(
     facts = report_facts(chosen, budget, structure, len(planned), shown, missing, warnings)
     facts |= {"seconds": time.perf_counter() - started}
     page = write_report(folder, facts, shown)
-    there, asked = (facts["episodes"][name] for name in ("there", "asked"))
-    json_file = page.with_suffix(".json")
-    return Validation(structure, tuple(results), tuple(missing), warnings, (there, asked), page, json_file)
+    return Validation(structure, tuple(results), warnings, facts["complete"], page)
 
 
 def _refuse_training(**given: Any) -> None:
@@ -136,13 +134,14 @@ def agent_names(agents: Names | None, dino_weights: Location | None) -> list[str
       DmcvbError: one is unknown, or lacks weights, or none needs those that are given.
     """
     from dmcvb_gen.agents.catalog import parse_agent
+    from dmcvb_gen.agents.dino import DinoEncoder
 
     names = [name.strip() for text in as_names(agents) for name in text.split(",") if name.strip()]
-    encoders = [agent.ready_encoder for agent in map(parse_agent, names) if agent.ready_encoder]
-    if dino_weights is not None and not encoders:
+    needed = any(agent.sees_by_dino for agent in map(parse_agent, names))
+    if dino_weights is not None and not needed:
         raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
-    if dino_weights is None and encoders:
-        raise DmcvbError(encoders[0].missing)
+    if dino_weights is None and needed:
+        raise DmcvbError(DinoEncoder.missing)
     return names
 
 

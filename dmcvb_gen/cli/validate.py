@@ -12,7 +12,6 @@ from dmcvb_gen.cli.common import answer
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.parallel import ignore
 from dmcvb_gen.progress import ProgressBar
-from dmcvb_gen.text import pluralize
 
 
 @command_of(run)
@@ -30,7 +29,7 @@ def validate(strict, as_json, **options):
     result = run(on_score=ignore if as_json else _show_score, **options)
     code = 0 if result.sound and result.complete and not (strict and result.warnings) else 1
     facts = json.loads(result.facts.read_text())
-    answer(as_json, facts, *_validated(result, facts["budget"]["note"]), code=code)
+    answer(as_json, facts, *_validated(result, facts), code=code)
 
 
 def _show_score(budget, cell, facts) -> None:
@@ -47,18 +46,16 @@ def _show_score(budget, cell, facts) -> None:
         click.echo(f"{cell.place} {cell.agent.name}: {score}{goal}{beside}")
 
 
-def _validated(result, note) -> Iterator[str]:
+def _validated(result, facts) -> Iterator[str]:
     """Yield the result of validate in lines."""
+    from dmcvb_gen.benchmarks.report import verdict
+
     yield from (f"FAIL {finding}" for finding in result.structure.findings[:50])
     yield from (f"FAIL {cell.id}: {error}" for cell, error in result.failed)
     yield from (f"warning: {finding}" for finding in result.warnings)
-    for entry in result.missing:
-        yield f"{entry.benchmark}: not in the release: {', '.join(entry.subsets)}"
-    checked = ", ".join(pluralize(count, name) for name, count in result.structure.checked.items())
-    found = len(result.structure.findings) + len(result.failed)
-    yield f"{'All checks passed' if result.sound else pluralize(found, 'findings')} ({checked})."
-    if not result.complete:
-        yield "Incomplete: {:,} of {:,} episodes.".format(*result.episodes)
+    for entry in facts["missing"]:
+        yield f"{entry['benchmark']}: not in the release: {', '.join(entry['subsets'])}"
+    yield verdict(facts)["text"]
     if result.results:
-        yield f"Profile {note}"
+        yield f"Profile {facts['budget']['note']}"
     yield f"Report: {result.report}"

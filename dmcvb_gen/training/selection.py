@@ -279,7 +279,6 @@ def select_checkpoints(
     folder: str | Path,
     episodes: int = 100,
     seed: int = 20_000,
-    deterministic: bool = True,
     progress: ProgressCallback = ignore,
 ) -> Selection:
     """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
@@ -306,7 +305,7 @@ def select_checkpoints(
         expect(progress, max(len(measured) + 1, MEASURED))
         progress(f"step {int(path.stem):,}")
         policy = measured[str(path)] = load_policy(path, task)
-        return evaluate(policy, task, episodes, seed, deterministic, streams=FRESH)[0]
+        return evaluate(policy, task, episodes, seed, streams=FRESH)[0]
 
     end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
     selection = pick_checkpoints(task.id, curve, base, end, measure)

@@ -211,8 +211,9 @@ TWO = {"episodes": 2}
 
 def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small_release):
     release, name = Release.open(small_release), "walker-walk/random/none"
-    half, two, again = (load_data(release, [Slice(name, **part)]) for part in ({"share": 0.34}, TWO, TWO))
-    assert (len(half.lengths), len(half), len(half.hold_out_rows)) == (1, 500, 0)
+    half, two, again = (load_data(release, [Slice(name, **part)]) for part in ({"share": 0.5}, TWO, TWO))
+    assert (len(half.lengths), len(half), len(half.hold_out_rows)) == (2, 500, 500)
+    assert len(load_data(release, [Slice(name, share=0.01)]).lengths) == 1
     assert (len(two.lengths), len(two), len(two.hold_out_rows)) == (2, 1000, 0)  # a counted few are all learned from
     torch.testing.assert_close(again.action, two.action)
     assert not torch.equal(load_data(release, [Slice(name, **TWO)], seed=5).action, two.action)

@@ -18,10 +18,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 import dmcvb_gen
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.data import Slice, load_data
+from dmcvb_gen.agents.networks import PATCHES
+from dmcvb_gen.benchmarks import evaluate as evaluation
 from dmcvb_gen.benchmarks.cell import data_score
 from dmcvb_gen.benchmarks.checks import (
     check_paper_returns,
@@ -104,8 +108,9 @@ def report(release, tmp_path_factory):
 
 def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     _, out, result = report
-    scores = [line for line in result.output.splitlines() if " [smoke]" in line]
-    assert len(scores) == 3 and "paper 9" not in result.output, "noise is not set beside the paper's numbers"
+    scores = [line for line in result.output.splitlines() if line.startswith(f"{NAME} ")]
+    assert len(scores) == 3 and all(" [smoke]" in line for line in scores)
+    assert "paper 9" not in result.output, "noise is not set beside the paper's numbers"
     assert "b1: not in the release: walker-walk/expert/none" in result.output
     page, facts = (out / "report.html").read_text(), json.loads((out / "report.json").read_text())
     assert page.index("All checks passed") < page.index("Structure") < page.index("Episode returns")
@@ -156,16 +161,6 @@ def test_its_tables_have_the_numbers_of_its_facts(report):
         assert float(lines[0].split(" ±")[0]) == pytest.approx(entry["score"]["mean"], rel=0.1)
         assert "[smoke]" in lines[0] and "paper" not in lines[-1]
     assert not shown
-
-
-def test_settings_that_share_trajectories_share_a_row_of_returns(report):
-    facts = json.loads((report[1] / "report.json").read_text())
-    [(name, values)] = facts["returns"].items()
-    place = name.rpartition("/")[0]
-    facts["returns"] |= {f"{place}/static": values, "cheetah-run/expert/none": values | {"mean": 1.0}}
-    assert [row[0] for row in _tables(facts)["returns"]["rows"]] == [
-        f"{place}/dynamic, static", f"the paper's {place}", "cheetah-run/expert/none", "the paper's cheetah-run/expert"
-    ]  # fmt: skip
 
 
 def test_every_group_of_cells_has_a_figure_with_its_data_if_they_are_alike(release):
@@ -261,7 +256,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
     for arguments, message in (
         ((release, "--profile", "fast"), "paper, quick, smoke"),
         ((release, "--agents", "bcc"), "state-bc"),
-        ((release, "--benchmark", "b9"), "ablations"),
+        ((release, "--benchmark", "b9"), "b1, b2, b3, b4"),
         ((release, "--benchmark", "b3"), "roll out ant-maze-empty7x7/expert/fixed"),
         ((release, "--benchmark", "b2", "--agents", "td3-bc,id+bc"), "td3-bc has none; remove it"),
         ((release, "--benchmark", "b2", "--agents", "td3-bc,bc"), "td3-bc has none; remove it"),
@@ -339,6 +334,97 @@ def test_names_are_text_on_the_page(report):
     facts["release"]["name"], facts["results"] = "<script>alert(1)</script>", []
     page = render_page(facts, [], None)
     assert "<script>" not in page and "&lt;script&gt;alert(1)" in page
+
+
+# -- policies that are kept: any score can be computed again, and hostile files make no network ------
+
+SMALL = dict(network=PATCHES, episodes=3)
+
+
+@pytest.fixture(scope="module")
+def walkers(scored, tmp_path_factory):
+    out = tmp_path_factory.mktemp("walkers")
+    scored(["state-bc", "td3-bc"], out, only="*/*/dynamic", **SMALL)
+    return out
+
+
+@pytest.fixture(scope="module")
+def mazes(scored, small_mazes, tmp_path_factory):
+    out = tmp_path_factory.mktemp("mazes")
+    scored(["state-td3-bc", "id+bc"], out, small_mazes, only="*/*/visible", **SMALL)
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("report", ["walkers", "mazes"])
+def test_every_score_of_a_report_is_computed_again_from_its_policy_file(report, request):
+    folder = request.getfixturevalue(report)
+    results = json.loads((folder / "report.json").read_text())["results"]
+    for result in results:
+        agent = load_agent(folder / "cells" / f"{result['id']}.safetensors")
+        options = dict(episodes=3, max_steps=10)
+        where = f"{result['cell']['task']}/{result['cell']['setting']}"
+        again = dmcvb_gen.evaluate(agent, where, **options)
+        assert list(again.returns) == result["final"]["returns"], result["id"]
+        assert dmcvb_gen.evaluate(agent, where, seed=1, **options).returns != again.returns
+    assert len(results) == 2
+
+
+@pytest.mark.parametrize("content", [None, b"not one"])
+def test_a_file_that_is_no_agent_is_refused(content, tmp_path):
+    path = tmp_path / "x.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DmcvbError, match="no agent that validate trained"):
+        load_agent(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change", [{"sizes": {"action": 10**7}}, {"sizes": {"state": 10**7}}, {"network": {"latent": 10**7}}, "no facts"]
+)
+def test_a_file_that_names_other_sizes_than_it_holds_makes_no_networks(change, walkers, tmp_path, monkeypatch):
+    kept = walkers / "cells" / "b1_walker-walk_dynamic_td3-bc_random.safetensors"
+    with safe_open(str(kept), "pt") as file:
+        facts = json.loads(file.metadata()["facts"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    changed = [] if change == "no facts" else facts | {key: facts[key] | new for key, new in change.items()}
+    save_file(tensors, str(tmp_path / "x.safetensors"), metadata={"facts": json.dumps(changed)})
+    made, untrained = [], evaluation._untrained
+
+    def watched(*arguments):
+        policy = untrained(*arguments)
+        made.append(next(policy.parameters()).device.type)
+        return policy
+
+    monkeypatch.setattr(evaluation, "_untrained", watched)
+    with pytest.raises(DmcvbError, match="no agent that validate trained"):
+        load_agent(tmp_path / "x.safetensors")
+    assert "cpu" not in made
+    assert load_agent(kept).agent.name == "td3-bc" and made[-2:] == ["meta", "cpu"]
+
+
+@pytest.mark.slow
+def test_an_evaluation_unlike_the_policys_data_is_refused_or_said(walkers, caplog, tmp_path):
+    agent = load_agent(walkers / "cells" / "b1_walker-walk_dynamic_td3-bc_random.safetensors")
+    options = dict(episodes=2, max_steps=2)
+    for wrong, told in (
+        (dict(size=32), "size is 32, and the policy learned with 16; leave size out"),
+        (dict(stack=1), "stack is 1, and the policy learned with 3; leave stack out"),
+        (dict(pixels=False), "pixels is False, and the policy learned with True; leave pixels out"),
+    ):
+        with pytest.raises(DmcvbError, match=told):
+            dmcvb_gen.evaluate(agent, "walker-walk/dynamic", **wrong, **options)
+    dmcvb_gen.evaluate(agent, "walker-walk/dynamic", **options)
+    assert not caplog.messages
+    (tmp_path / "clips" / "val" / "one").mkdir(parents=True)
+    Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(tmp_path / "clips" / "val" / "one" / "0.png")
+    dmcvb_gen.evaluate(agent, "walker-walk/dynamic", backgrounds=str(tmp_path / "clips"), **options)
+    drawn = {"renderer": {"name": "opengl", "samples": 4}}
+    elsewhere = dataclasses.replace(agent, evaluation=agent.evaluation | drawn)
+    dmcvb_gen.evaluate(elsewhere, "walker-walk/dynamic", renderer="native", **options)
+    videos, renderer = caplog.messages
+    assert "has backgrounds" in videos and "has renderer" in renderer and "opengl" in renderer
 
 
 # -- damage ---------------------------------------------------------------------------------------
