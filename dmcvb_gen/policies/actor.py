@@ -16,9 +16,6 @@ from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
 from dmcvb_gen.policies.open_maze import PLACE_SCALE, open_maze_observation, places
 from dmcvb_gen.tasks.base import Task
 
-NORM_EPSILON = 1e-5
-"""Added to the variance in a layer norm, as torch does."""
-
 
 @kept_njit(nogil=True, error_model="numpy")
 def _affine(x, weight, bias, out):
@@ -62,14 +59,6 @@ _ACTIVATIONS = {
     "elu": _elu,
     "gelu": lambda x: (0.5 * x * (1 + arithmetic.erf(x * np.sqrt(0.5)))).astype(np.float32),
 }
-
-
-def _layer_norm(x: np.ndarray, scale: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    columns = x.T.astype(np.float64)
-    count = len(columns)
-    centered = columns - arithmetic.total(columns) / count
-    deviation = np.sqrt(arithmetic.total(centered * centered) / count + NORM_EPSILON)
-    return ((centered / deviation).T * scale + shift).astype(np.float32)
 
 
 class Policy:
@@ -120,12 +109,8 @@ class Policy:
         limit = np.float32(header.clip_observation)
         x = (np.asarray(observation, np.float32) - weights["observation_mean"]) / weights["observation_std"]
         x = np.ascontiguousarray(np.clip(x, -limit, limit))
-        layers = 3 if header.layer_norm else 2
         for index in range(len(header.hidden)):
-            x = self._dense(f"body.{layers * index}", x)
-            if header.layer_norm:
-                norm = f"body.{layers * index + 1}"
-                x = _layer_norm(x, weights[f"{norm}.weight"], weights[f"{norm}.bias"])
+            x = self._dense(f"body.{2 * index}", x)
             x = np.ascontiguousarray(_ACTIVATIONS[header.activation](x))
         return x
 

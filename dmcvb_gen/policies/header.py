@@ -15,11 +15,6 @@ LOG_STD_RANGE = (-20.0, 2.0)
 """Where the log standard deviation of a squashed Gaussian is clipped (Haarnoja et al. 2018)."""
 MAX_LAYERS, MAX_WIDTH = 16, 65_536
 """Hidden layers, and units of one, that a header may ask for."""
-Mode = Annotated[
-    Literal["mean", "sampled"],
-    pydantic.BeforeValidator(lambda mode: "mean" if mode == "deterministic" else mode),
-]
-"""Which actions were taken; "deterministic" is what version 0.1 wrote for "mean"."""
 OWN_CODE = "own-code"
 """Algorithm of a behaviour that is a function of the user's."""
 ORIGINS = {
@@ -49,7 +44,7 @@ class Evaluation(_Model):
     mean: float
     std: float
     episodes: int = pydantic.Field(gt=0)
-    mode: Mode
+    mode: Literal["mean", "sampled"]
     seed: int
     quartiles: tuple[float, float, float, float, float] | None = None
     success: float | None = None
@@ -66,7 +61,7 @@ class PolicyHeader(_Model):
       agent_step: environment steps (at its action repeat) it was trained for.
       action_repeat: control steps that its actions were held in training; files leave out 2.
       hidden: widths of the hidden layers.
-      layer_norm: True if each hidden layer is normalized before its activation.
+      layer_norm: False, as files of format 1 and 2 say; no hidden layer is normalized.
       distribution: "squashed_gaussian": tanh(mean + std * noise); "gaussian": clipped to [-1, 1];
         "deterministic": the mean, with fixed `noise` added when sampling.
       way: widths of the hidden layers of the network that says where to head in a maze (`policies.open_maze`); None:
@@ -90,7 +85,7 @@ class PolicyHeader(_Model):
     hidden: Annotated[tuple[Width, ...], pydantic.Field(max_length=MAX_LAYERS)]
     way: Annotated[tuple[Width, ...] | None, pydantic.Field(max_length=MAX_LAYERS)] = None
     activation: Literal["relu", "tanh", "elu", "gelu"] = "relu"
-    layer_norm: bool = False
+    layer_norm: Literal[False] = False
     distribution: Literal["squashed_gaussian", "gaussian", "deterministic"] = "squashed_gaussian"
     noise: float = 0.0
     clip_observation: float = 10.0
@@ -124,7 +119,7 @@ def origin_of(algorithm: str) -> str:
 def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:
     """name -> shape of the weights of a header's actor, an MLP from observations to parameters of the distribution.
 
-    `body.<i>` are hidden layers (numbered with their norms and activations), `mean` and `log_std` the heads (for
+    `body.<i>` are hidden layers (numbered with their activations), `mean` and `log_std` the heads (for
     "gaussian" a free vector `log_std_vector`); `observation_mean` and `observation_std` normalize what comes in.
     `way.<i>` are the layers of the network that knows the way, if there is one.
     """
@@ -133,13 +128,10 @@ def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:
         widths = (WAY_SIZE, *header.way, 2)
         for index, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
             shapes |= {f"way.{2 * index}.weight": (fan_out, fan_in), f"way.{2 * index}.bias": (fan_out,)}
-    width, place = header.observation_size, 0
-    for hidden in header.hidden:
-        shapes |= {f"body.{place}.weight": (hidden, width), f"body.{place}.bias": (hidden,)}
-        if header.layer_norm:
-            place += 1
-            shapes |= {f"body.{place}.weight": (hidden,), f"body.{place}.bias": (hidden,)}
-        width, place = hidden, place + 2
+    width = header.observation_size
+    for index, hidden in enumerate(header.hidden):
+        shapes |= {f"body.{2 * index}.weight": (hidden, width), f"body.{2 * index}.bias": (hidden,)}
+        width = hidden
     heads = ("mean", "log_std") if header.distribution == "squashed_gaussian" else ("mean",)
     for head in heads:
         shapes |= {f"{head}.weight": (header.action_size, width), f"{head}.bias": (header.action_size,)}

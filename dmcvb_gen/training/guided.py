@@ -194,7 +194,7 @@ def network(run: Run) -> dict[str, Any]:
     """The header's fields that say how the actor is built: as the policy that walks, with a way before it."""
     base = base_policy(run)
     header = base.header
-    kept = ("hidden", "activation", "layer_norm", "distribution", "noise", "clip_observation")
+    kept = ("hidden", "activation", "distribution", "noise", "clip_observation")
     fields = {name: getattr(header, name) for name in kept}
     return fields | {"way": (run.settings.width,) * run.settings.layers, "training": {"walker": base.digest}}
 

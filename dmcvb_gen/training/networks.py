@@ -29,8 +29,6 @@ class Actor(nn.Module):
         width = header.observation_size
         for hidden in header.hidden:
             layers.append(nn.Linear(width, hidden))
-            if header.layer_norm:
-                layers.append(nn.LayerNorm(hidden))
             layers.append(_ACTIVATIONS[header.activation]())
             width = hidden
         self.body = nn.Sequential(*layers)

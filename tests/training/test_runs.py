@@ -351,7 +351,7 @@ def test_a_run_begins_with_the_actor_of_the_policy_or_the_networks_of_the_run_th
     [
         ({"hidden": (24,)}, r"size mismatch for body\.0\.weight"),
         ({"activation": "tanh"}, "activation tanh, expected relu"),
-        ({"layer_norm": True}, "Unexpected key"),
+        ({"distribution": "gaussian"}, "Unexpected key"),
     ],
 )
 def test_a_policy_that_does_not_fit_begins_no_run(tmp_path, changes, words):
