@@ -12,7 +12,9 @@ import hashlib
 import numpy as np
 
 STREAMS = ("initial_state", "policy", "camera", "color", "background", "style", "cue", "shake", "light")
-"""The streams of an episode, in the order of their spawn keys. Append only: an index is part of the data."""
+"""The streams of an episode, in the order of their spawn keys. Append only: an index is part of the data.
+
+No distractor draws from "shake" any more."""
 
 
 def name_key(*names: str) -> tuple[int, ...]:

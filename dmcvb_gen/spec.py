@@ -73,11 +73,9 @@ DIFFICULTIES = tuple(DIFFICULTY_SCALES)
 SCALED_PARTS = ("camera", "color")
 DISTRACTOR_PARTS = (*SCALED_PARTS, "background")
 """The parts of DMC-VB's distractors, each of which can vary alone."""
-CUE, SHAKE, LIGHT = "cue", "shake", "light"
+CUE, LIGHT = "cue", "light"
 """Parts besides, of dynamic distractors alone. A cue's number is its correlation with the action before a frame."""
-FURTHER_PARTS = (SHAKE, LIGHT)
-"""Further parts that have a scale s, for dynamic distractors alone."""
-ALL_PARTS = (*DISTRACTOR_PARTS, *FURTHER_PARTS, CUE)
+ALL_PARTS = (*DISTRACTOR_PARTS, LIGHT, CUE)
 """In the order of a difficulty's spelling."""
 ALL = "all"
 """In a difficulty, in place of a number of background videos: all of them."""
@@ -147,10 +145,9 @@ class DistractorSetting:
       kind: "none", "static", "dynamic", or one of a user's own.
       difficulty: "easy", "medium" or "hard"; or a scale above 0 and up to 1 ("0.35"); or the parts that vary, each
         with a number of its own if medium's is not meant: "camera0.1-color0.5-background4" (a background's number is
-        how many videos are in play). Three parts of dynamic distractors come besides: "shake0.3" shifts the camera in
-        every frame, "light0.3" moves the lamps, and "cue0.8" is a spurious cue in the colors that correlates with the
-        last action by 0.8. What amounts
-        to a word is turned into it: "0.2" is "medium".
+        how many videos are in play). Two parts of dynamic distractors come besides: "light0.3" moves the lamps, and
+        "cue0.8" is a spurious cue in the colors that correlates with the last action by 0.8. What amounts to a word is
+        turned into it: "0.2" is "medium".
 
     Raises:
       UnknownNameError: there is no such kind or difficulty. DmcvbError: a number is out of range.
@@ -169,9 +166,7 @@ class DistractorSetting:
             raise DmcvbError(f"distractor {self.kind} has no parts such as {self.difficulty}; give a scale, e.g. 0.35")
 
         if self.kind != "dynamic" and not set(_strengths(self.difficulty)) <= set(DISTRACTOR_PARTS):
-            raise DmcvbError(
-                f"distractor {self.kind} has no {CUE}, {SHAKE} or {LIGHT}; ask for dynamic_{self.difficulty}"
-            )
+            raise DmcvbError(f"distractor {self.kind} has no {CUE} or {LIGHT}; ask for dynamic_{self.difficulty}")
 
     @property
     def name(self) -> str:
@@ -194,7 +189,7 @@ class DistractorSetting:
     @property
     def scale(self) -> float:
         """The scale s of all ranges; the largest one if parts have their own, 0 without distractors."""
-        strengths, parts = _strengths(self.difficulty), (*SCALED_PARTS, *FURTHER_PARTS)
+        strengths, parts = _strengths(self.difficulty), (*SCALED_PARTS, LIGHT)
         return 0.0 if self.kind == "none" else max(float(strengths.get(part) or 0.0) for part in parts)
 
     @property
@@ -354,9 +349,7 @@ class SubsetSpec:
     @property
     def camera_moves(self) -> bool:
         """True if the camera moves: it follows the ant in mazes, and wanders in dynamic distractors."""
-        return self.goal is not None or (
-            self.distractor.kind == "dynamic" and (self.distractor.varies("camera") or self.distractor.varies(SHAKE))
-        )
+        return self.goal is not None or (self.distractor.kind == "dynamic" and self.distractor.varies("camera"))
 
 
 def subset_name(task_id: str, level: str, setting: str) -> str:

@@ -32,7 +32,7 @@ Distractors:
   dynamic_hard              strength 0.3 and all background videos
   dynamic_0.35              any strength up to 1
   dynamic_camera0.1         only this part varies, with its own strength;
-                            parts: camera, color, background, shake, light
+                            parts: camera, color, background, light
   static_color-background4  two parts; of a background, the number of videos
   dynamic_color-cue0.8      a cue that correlates with the last action
 """

@@ -17,12 +17,11 @@ from dmcvb_gen.distractors.camera import Camera
 from dmcvb_gen.distractors.color import Color
 from dmcvb_gen.distractors.cue import Cue
 from dmcvb_gen.distractors.light import Light
-from dmcvb_gen.distractors.shake import Shake
 from dmcvb_gen.distractors.style import Style
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.spec import DISTRACTOR_ENTRY_POINTS, DISTRACTOR_KINDS, DistractorSetting, kind_of
 
-BUILT_IN: tuple[type[Distractor], ...] = (Camera, Color, Background, Style, Cue, Shake, Light)
+BUILT_IN: tuple[type[Distractor], ...] = (Camera, Color, Background, Style, Cue, Light)
 """Together they give every label."""
 
 
