@@ -10,7 +10,7 @@ from scipy.stats import ks_2samp, kstest
 
 from dmcvb_gen.distractors import Distractor, DistractorSetting, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
-from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, cartesian, look_at, spherical
+from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, spherical
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.own_code import DISTRACTORS
 from dmcvb_gen.seeding import STREAMS, episode_stream
@@ -274,11 +274,3 @@ def test_difficulty_decides_how_many_videos_are_in_play():
     for difficulty, videos in (("easy", 4), ("medium", 8), ("hard", len(backgrounds))):
         seen = labels(task, f"static_{difficulty}", physics).background_video
         assert set(np.unique(seen)) == set(range(videos))
-
-
-def test_look_at_without_roll_keeps_the_horizon_level():
-    offset = cartesian(np.array([[3.0, 2.0], [1.0, 0.5], [-1.2, -3.0]])).T
-    frame = look_at(offset, np.zeros(2))
-    np.testing.assert_allclose(frame[:, 2, 0], 0, atol=1e-12)  # right is horizontal
-    assert (frame[:, 2, 1] > 0).all()  # up points up
-    np.testing.assert_allclose(np.linalg.det(frame), 1)

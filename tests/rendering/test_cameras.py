@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.tasks import cameras, get_task
-from dmcvb_gen.tasks.cameras import Kinematics, centers_of_mass, matrices, nominal_cameras, quaternions
+from dmcvb_gen.tasks.cameras import Kinematics, centers_of_mass, nominal_cameras
 from tests.conftest import TINY_MAZE
 from tests.distractors.test_distractors import physics_of
 from tests.tasks import hostile_tasks as h
@@ -54,15 +54,3 @@ def test_threads_get_their_own_states_poses():
         found = list(pool.map(lambda i: centers_of_mass(task, physics[i % 8][None]), range(400)))
     for index, value in enumerate(found):
         np.testing.assert_array_equal(value, expected[index % 8])
-
-
-def test_quaternions_do_not_depend_on_the_batch():
-    rng = np.random.default_rng(0)
-    quaternion = rng.normal(size=(1001, 4))
-    rotation = matrices(quaternion)
-    for index in (0, 500, 1000):
-        expected = np.empty(9)
-        mujoco.mju_quat2Mat(expected, quaternion[index] / np.linalg.norm(quaternion[index]))
-        np.testing.assert_allclose(rotation[index].ravel(), expected, atol=1e-14)
-        np.testing.assert_array_equal(matrices(quaternion[index]), rotation[index])
-        np.testing.assert_array_equal(quaternions(rotation[index]), quaternions(rotation)[index])
