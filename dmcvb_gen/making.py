@@ -6,7 +6,6 @@ docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resume
 
 import hashlib
 import json
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from annotated_types import Gt, Lt
@@ -25,7 +24,7 @@ from dmcvb_gen.options import (
     checked,
     progress_bar,
 )
-from dmcvb_gen.parallel import Workers, ignore
+from dmcvb_gen.parallel import Workers
 from dmcvb_gen.spec import SubsetSpec, is_maze, subset_name
 from dmcvb_gen.text import as_names
 
@@ -207,7 +206,6 @@ def paint(
     workers: Workers | None = None,
     backgrounds: Location | None = None,
     progress: bool = True,
-    notify: Callable[[str], None] = ignore,
 ) -> "RenderResult":
     """Render the images of a release that has none, and compare them with their known digests.
 
@@ -221,8 +219,6 @@ def paint(
       workers: Worker processes. [default: a core each, as far as memory allows]
       backgrounds (FOLDER): Folder of the background videos, if the release has no copies.
 
-    `notify` is called with each difference to the environment that made the release, before rendering.
-
     Raises:
       DmcvbError: nothing matches, a shard is damaged, or the videos are not those of the manifest; a URL is given.
     """
@@ -233,7 +229,7 @@ def paint(
     wanted = Wanted(size, None if views is None else as_names(views), goal)
     videos = None if backgrounds is None else background_source(backgrounds)
     with progress_bar(progress, " frames") as bar:
-        given: dict[str, Any] = dict(workers=workers, backgrounds=videos, progress=bar, notify=notify)
+        given: dict[str, Any] = dict(workers=workers, backgrounds=videos, progress=bar)
         return paint_release(local_path(release), as_names(only), episode_range, wanted, **given)
 
 

@@ -23,8 +23,7 @@ from dmcvb_gen.version import __version__
 GROUPS = {
     "Make data": {
         "rollout": ("rollout:rollout", "Roll out behaviour policies into a release of episodes."),
-        "cluster": ("rollout:cluster", "Make a release on many machines: begin, part, finish, slurm."),
-        "status": ("look:status", "Show the progress of an unfinished release."),
+        "cluster": ("rollout:cluster", "Make a release on many machines: begin, part, finish."),
         "paint": ("paint:paint", "Render the images of a release stored without pixels."),
         "repaint": ("release:repaint", "Render stored episodes with other distractors, size or renderer."),
         "regenerate": ("release:regenerate", "Check, repair or copy a release by regenerating its shards."),
@@ -41,7 +40,6 @@ GROUPS = {
         "view": ("view:view", "Write one HTML file that plays the episodes of a release."),
         "verify": ("release:verify", "Check every file, value, state and image of a release."),
         "validate": ("validate:validate", "Train the paper's agents on a release and report their scores."),
-        "diff": ("release:diff_command", "Compare two releases: subsets, episodes and digests."),
     },
     "Share": {
         "card": ("view:card", "Write the card of a release: README.md, croissant.json, images."),

@@ -1,4 +1,4 @@
-"""list, info, status."""
+"""list, info."""
 
 from __future__ import annotations
 
@@ -130,34 +130,3 @@ def list_command(as_json):
         click.echo(textwrap.fill(f"{heading}: {', '.join(names)}", 80, break_on_hyphens=False))
     for name, reason in facts["renderers"].items():
         click.echo(f"renderer {name}: {'usable' if reason is None else 'not usable here: ' + reason}")
-
-
-@click.command()
-@click.argument("place", metavar="RELEASE|URL")
-@remote_option
-@json_option
-def status(place, options, as_json):
-    """Show the progress of an unfinished release: shards done and open.
-
-    It reads the records, so it works from any machine.
-
-    \b
-    dmcvb-gen status s3://bucket/mine
-    """
-    from dmcvb_gen.generate.progress import progress_of
-    from dmcvb_gen.storage.store import open_store
-
-    found = progress_of(open_store(place, options))
-    if as_json:
-        return print_json(found.facts())
-    print_table(
-        ("subset", "done", "open"),
-        [(subset.name, f"{subset.done:,}", f"{subset.total - subset.done:,}") for subset in found.subsets],
-        title=f"{found.name}: {found.done:,} of {found.total:,} shards",
-    )
-    if found.done == found.total:
-        click.echo(
-            "complete"
-            if found.complete
-            else f"All shards are done; finish the release: dmcvb-gen cluster finish {quoted(place)}"
-        )

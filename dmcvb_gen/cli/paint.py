@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-import click
-
 from dmcvb_gen import making
 from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.release.fetch import download
 from dmcvb_gen.release.fetch import fetch as run_fetch
-from dmcvb_gen.text import pluralize, printable
+from dmcvb_gen.text import pluralize
 
 
 @command_of(making.paint)
@@ -26,7 +24,7 @@ def paint(release, as_json, **options):
     dmcvb-gen rollout walker-walk --no-pixels --out releases/light
     dmcvb-gen paint releases/light --workers 2
     """
-    done = making.paint(release, notify=_tell, **options)
+    done = making.paint(release, **options)
     facts = {"out": release} | _painted_facts(done)
     answer(as_json, facts, *_painted(release, done), code=1 if done.differing else 0)
 
@@ -41,16 +39,11 @@ def fetch(as_json, **options):
     dmcvb-gen fetch s3://bucket/mini --only 'walker-walk/*' --out data/mini
     dmcvb-gen fetch s3://bucket/light --paint --out data/light
     """
-    moved, done = download(options, notify=_tell)
+    moved, done = download(options)
     out = options["out"]
     facts = dataclasses.asdict(moved) | (_painted_facts(done) if done else {})
     lines = [f"{out}: {moved_files(moved)}", *(_painted(out, done) if done else ())]
     answer(as_json, facts, *lines, code=1 if done and done.differing else 0)
-
-
-def _tell(text):
-    """Print a difference to the machine that made the release, apart from the output."""
-    click.echo(f"note: {printable(text, ' ')}", err=True)
 
 
 def _painted_facts(done):

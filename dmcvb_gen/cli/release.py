@@ -1,14 +1,12 @@
-"""verify, regenerate, repaint, publish, fetch, card, export."""
+"""verify, regenerate, repaint, publish, export."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
 
-import click
-
 from dmcvb_gen import making
-from dmcvb_gen.cli.common import answer, json_option, moved_files, remote_option
+from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.dataset.manifest import VIDEOS
 from dmcvb_gen.release.export import export as run_export
@@ -138,8 +136,7 @@ def publish(release, url, as_json, **options):
     """Upload a complete release: every file is checked, and the manifest comes last.
 
     A published version never changes. Rerun the command to resume. Add --repair to replace files that `verify URL`
-    found damaged. Credentials come from the environment. Exports can be uploaded, too. On the Hub, a LeRobot export
-    gets the tag that LeRobot looks for.
+    found damaged. Credentials come from the environment.
 
     \b
     dmcvb-gen publish releases/mini s3://bucket/dmcvb-mini
@@ -161,23 +158,3 @@ def export(release, to, out, as_json, **options):
     folders = run_export(release, to, out, **options)
     shown = [str(Path(out) / folder.relative_to(Path(out).absolute())) for folder in folders]  # as --out names them
     answer(as_json, shown, *shown)
-
-
-@click.command("diff")
-@click.argument("one", metavar="RELEASE|URL")
-@click.argument("other", metavar="RELEASE|URL")
-@remote_option
-@json_option
-def diff_command(one, other, options, as_json):
-    """Compare two releases by their manifests and records: subsets, episodes and digests.
-
-    Exit code 0 if they are equal, 1 if not.
-
-    \b
-    dmcvb-gen diff releases/mini s3://bucket/dmcvb-mini
-    """
-    from dmcvb_gen.release.diff import diff
-
-    found = diff(one, other, options)
-    facts = [dataclasses.asdict(difference) for difference in found]
-    answer(as_json, {"differences": facts}, *(found or ["no difference"]), code=1 if found else 0)

@@ -10,7 +10,6 @@ import click
 from dmcvb_gen import making
 from dmcvb_gen.cli.common import answer, json_option, print_json, print_table, remote_option
 from dmcvb_gen.cli.options import command_of, parse_part
-from dmcvb_gen.cli.slurm import script_for_slurm
 from dmcvb_gen.options import progress_bar
 from dmcvb_gen.storage.places import is_url
 from dmcvb_gen.text import format_bytes, pluralize
@@ -112,7 +111,7 @@ def finish(release, options, as_json):
     """Write the manifest of all finished shards. Exit code 1 while shards are missing."""
     from dmcvb_gen.dataset.gate import Release
     from dmcvb_gen.dataset.writer import finish as write
-    from dmcvb_gen.generate.progress import missing_subsets
+    from dmcvb_gen.generate.works import missing_subsets
     from dmcvb_gen.storage.store import open_store
 
     store = open_store(release, options)
@@ -126,16 +125,7 @@ def finish(release, options, as_json):
     answer(as_json, facts, f"{store.place}: {state}", code=1 if missing else 0)
 
 
-@click.command()
-@click.argument("release", metavar="RELEASE|URL")
-@click.option("--tasks", "count", type=click.IntRange(1), required=True, metavar="N", help="Tasks of the Slurm array.")
-@click.option("--cores", type=click.IntRange(1), default=1, show_default=True, help="Cores of each task.")
-def slurm(release, count, cores):
-    """Print a script for `sbatch` that makes a begun release by an array of N tasks."""
-    click.echo(script_for_slurm(count, cores, release), nl=False)
-
-
-for subcommand in (begin, part, finish, slurm):
+for subcommand in (begin, part, finish):
     cluster.add_command(subcommand)
 
 
@@ -158,7 +148,7 @@ def _plan(options):
 
 def _run(plan, workers, as_json, whole=True):
     from dmcvb_gen.generate.plan import run_plan
-    from dmcvb_gen.generate.progress import missing_subsets
+    from dmcvb_gen.generate.works import missing_subsets
 
     with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
         made = run_plan(plan, workers, bar, finishing=whole)
@@ -166,7 +156,7 @@ def _run(plan, workers, as_json, whole=True):
     complete = whole and not missing_subsets(release)
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))
     named = shlex.quote(str(place))
-    state = "complete" if complete else f"not complete yet (dmcvb-gen status {named} says what is missing)"
+    state = "complete" if complete else f"not complete yet (dmcvb-gen rollout --out {named} --dry-run shows the rest)"
     if not whole:
         state = f"finished with `dmcvb-gen cluster finish {named}` when all parts are done"
     rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""

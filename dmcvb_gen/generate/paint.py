@@ -7,7 +7,8 @@ digests; others become layers of the release's own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,9 @@ from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import HIDDEN
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.text import printable
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -93,9 +97,8 @@ def paint_release(
     workers: Workers | None = None,
     backgrounds: str | None = None,
     progress: ProgressCallback = ignore,
-    notify: Callable[[str], None] = ignore,
 ) -> RenderResult:
-    """Render the missing images of a release.
+    """Render the missing images of a release. What differs here from where it was made is logged before.
 
     Args:
       place: the release's folder.
@@ -103,7 +106,6 @@ def paint_release(
       episodes: (first, last + 1) of each subset; the shards that hold any of them are rendered.
       wanted: which images.
       backgrounds: folder of the videos, if the release has no copies.
-      notify: called with a line for each difference to the environment that made the release, before rendering.
 
     Raises:
       DmcvbError: nothing matches, a shard is damaged, the videos are not those of the manifest, or no room.
@@ -113,7 +115,6 @@ def paint_release(
     records = _paintable(release, only, wanted)
     root = local_inputs(store, release.inputs_of([record.name for record in records]))
     sources = {record.name: background_source(root, record, backgrounds) for record in records}
-    drift = render_differences(release, records, sources)
     layers = {record.name: _layers_of(release, record, wanted, sources[record.name]) for record in records}
     below = {layer.name: _labels(release, record).name for record in records for layer in layers[record.name]}
     if below.keys() - release.layers.keys():
@@ -125,15 +126,16 @@ def paint_release(
         return labels is not None and shard in release.here(labels) and can_be_rendered(release, layer, shard)
 
     works = works_of(release, [record.name for record in records], episodes, is_missing, backgrounds=backgrounds)
-    for text in drift if works else ():
-        notify(text)
+    drift = render_differences(release, records, sources) if works else ()
+    for text in drift:
+        _log.warning(printable(text, " "))
     if works:
         write_provenance(store, "paint")
     done = list(run_works(works, workers, progress))
     outcomes = [outcome for result in done for outcome in result.outcomes]
     differing = sorted(f"{each.layer} shard {each.shard}" for each in outcomes if each.equal is False)
     known = sum(each.equal is not None for each in outcomes)
-    return RenderResult(finish(store), len(outcomes), known, tuple(differing), drift if works else ())
+    return RenderResult(finish(store), len(outcomes), known, tuple(differing), drift)
 
 
 def _paintable(release: Release, only: Sequence[str], wanted: Wanted) -> list[SubsetRecord]:

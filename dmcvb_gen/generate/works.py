@@ -184,3 +184,10 @@ def episodes_left(works: Sequence[Work]) -> Counter[str]:
                 last = min(work.episodes.stop, setting.record.episodes)
                 left[setting.record.name] += last - work.episodes.start
     return left
+
+
+def missing_subsets(release: Release) -> list[str]:
+    """Subsets that recipes ask for, and that a release does not have, or not whole."""
+    asked = {record.name: record.episodes for record in Release.in_making(release.store).manifest.subsets}
+    there = {} if release.in_the_making else {record.name: record.episodes for record in release.manifest.subsets}
+    return [name for name, episodes in asked.items() if there.get(name, 0) < episodes]

@@ -4,7 +4,7 @@ Inputs and recipes come first, then each shard with its record last, the lists, 
 sizes alone are compared, so nothing is read twice. A part of a release is a copy: copy.json says of what.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
 from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
 from dmcvb_gen.options import Count, Local, Names, Span, checked, progress_bar
-from dmcvb_gen.parallel import ProgressCallback, expect, ignore
+from dmcvb_gen.parallel import ProgressCallback, expect
 from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at, manifest_text
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path, shown
@@ -70,7 +70,7 @@ def fetch(
     return open_for_reading(str(out))
 
 
-def download(given: Mapping[str, Any], notify: Callable[[str], None] = ignore) -> tuple[Moved, "RenderResult | None"]:
+def download(given: Mapping[str, Any]) -> tuple[Moved, "RenderResult | None"]:
     """Do what the arguments of `fetch` ask for: what was moved and, with `paint`, what was rendered."""
     only, episodes, folder = as_names(given["only"]), given["episode_range"], local_path(given["out"])
     with progress_bar(given["progress"], "B") as bar:
@@ -82,7 +82,7 @@ def download(given: Mapping[str, Any], notify: Callable[[str], None] = ignore) -
     from dmcvb_gen.making import paint  # here, as it needs a simulator
 
     chosen = dict(only=only, episode_range=episodes, progress=given["progress"])
-    return moved, paint(given["out"], **chosen, notify=notify)
+    return moved, paint(given["out"], **chosen)
 
 
 def _fetch(

@@ -13,9 +13,8 @@ from dmcvb_gen.dataset.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, ca
 from dmcvb_gen.dataset.writer import copy_of, plain_metadata, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
-from dmcvb_gen.options import Count, Location, checked, progress_bar, refuse
+from dmcvb_gen.options import Count, Location, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, expect
-from dmcvb_gen.release.export.publishing import export_format, publish_export
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at, manifest_text
 from dmcvb_gen.storage.store import Store, open_store
@@ -33,10 +32,10 @@ def publish(
     pixels: bool = True,
     progress: bool = True,
 ) -> Moved:
-    """Put a complete release, or an export, at a URL: every file checked, the manifest last.
+    """Put a complete release at a URL: every file checked, the manifest last.
 
     Args:
-      release (RELEASE): Folder of the release, or of an export.
+      release (RELEASE): Folder of the release.
       url (URL): Where to put it: s3://, gs://, az://, hf:// or file:.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
       repair: Compare published files by their digests, and replace those that differ.
@@ -48,9 +47,6 @@ def publish(
         refused; a file could not be moved.
     """
     with progress_bar(progress, " files", scaled=False) as bar:
-        if not (Path(release) / MANIFEST).exists() and export_format(release) is not None:
-            refuse("it is for releases, and this is an export", **{"no-pixels": not pixels, "repair": repair})
-            return publish_export(release, url, options=storage_options, workers=workers, tick=bar)
         return _publish_release(release, open_store(url, storage_options), pixels, repair, workers, bar)
 
 

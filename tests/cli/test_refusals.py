@@ -83,7 +83,7 @@ OTHERS = [
     ("rollout walker-walk --level random --no-pixels --out hole.txt/r", "hole.txt is a file; choose another place"),
     ("info empty", "holds no release"),
     ("info s3://", "s3:// names no bucket; give s3://BUCKET/NAME"),
-    ("diff a b c", "see `dmcvb-gen diff --help`"),
+    ("info a b", "see `dmcvb-gen info --help`"),
     ("evaluate-behaviour walker-walk --level random --sample", "level random is always drawn"),
     ("evaluate-behaviour --level random --behaviour walker.safetensors", "level random has no policy"),
     ("repaint r --only */none --split val --out new", "these subsets show no videos"),

@@ -1,4 +1,4 @@
-"""Releases made on many machines: parts that share nothing but a store, Slurm's script, and a Ray cluster."""
+"""Releases made on many machines: parts that share nothing but a store, and a Ray cluster."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def test_parts_made_anywhere_give_the_files_of_one_rollout(whole, recipe_file, t
     for part in ("2/3", "1/3"):
         run("cluster", "part", place, part, "--workers", 1)
     assert "not complete" in invoke("cluster", "finish", place, code=1).output
-    found = told("status", place)
-    assert (found["done"], found["total"], found["complete"]) == (9, 12, False)
+    left = told("rollout", "--out", place, "--dry-run")
+    assert left["shards"] == 2 and sum(subset["left"] for subset in left["subsets"]) == 3
     run("cluster", "part", place, "3/3", "--workers", 1)
-    assert "finish the release: dmcvb-gen cluster finish" in run("status", place)
+    assert "not finished: dmcvb-gen cluster finish" in invoke("verify", place, code=3).output
     done = told("cluster", "finish", place)
     assert done["complete"] and done["digest"] == whole.digest
-    assert contents(place) == contents(Path(whole.path)) and "complete" in run("status", place)
+    assert contents(place) == contents(Path(whole.path)) and told("rollout", "--out", place, "--dry-run")["shards"] == 0
 
 
 def test_two_who_make_the_same_shards_end_in_one_release(whole, tmp_path):
@@ -77,32 +77,6 @@ def test_parts_and_repeated_begins_obey_the_renderer_of_the_begun_release(tmp_pa
         run("cluster", *command)
     assert begun["shards"] == 1 and len(list((tmp_path / "r" / "recipes").iterdir())) == 1
     assert [record.renderer["name"] for record in Release.open(tmp_path / "r").manifest.subsets] == ["native"]
-
-
-FAKE = """#!/bin/bash
-echo "$(basename "$0") $*" >> {log}
-"""
-
-
-def test_the_slurm_script_does_parts_and_finishes(tmp_path):
-    script = tmp_path / "job.sh"
-    script.write_text(run("cluster", "slurm", tmp_path / "r", "--tasks", "3", "--cores", "2"))
-    (tmp_path / "bin").mkdir()
-    for name in ("dmcvb-gen", "sbatch", "squeue"):
-        (tmp_path / "bin" / name).write_text(FAKE.format(log=tmp_path / "log"))
-        (tmp_path / "bin" / name).chmod(0o755)
-    for task in (1, 2):
-        environment = {"PATH": f"{tmp_path}/bin:/usr/bin:/bin", "SLURM_ARRAY_JOB_ID": "7"}
-        environment["SLURM_ARRAY_TASK_ID"] = str(task)
-        subprocess.run(["bash", str(script)], env=environment, check=True)
-    assert (tmp_path / "log").read_text().splitlines() == [
-        "squeue --noheader --name=dmcvb-gen-finish-7",
-        f"sbatch --dependency=afterok:7 --job-name=dmcvb-gen-finish-7 --requeue "
-        f"--wrap=dmcvb-gen cluster finish {tmp_path / 'r'}",
-        f"dmcvb-gen cluster part {tmp_path / 'r'} 1/3 --workers 2",
-        f"dmcvb-gen cluster part {tmp_path / 'r'} 2/3 --workers 2",
-    ]
-    assert "submit this with sbatch" in subprocess.run(["bash", str(script)], capture_output=True, text=True).stderr
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ import pandas
 import pyarrow.parquet as pq
 import pytest
 
-from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.release.export import export
 from tests.conftest import roll_out
@@ -44,21 +43,6 @@ def test_an_episode_is_a_row_group_and_statistics_have_quantiles(stored, tmp_pat
         top = values["pixels"][:length, 0].reshape(-1, 3) / 255
         np.testing.assert_allclose(np.ravel(row["stats/observation.images.top/q99"]), np.quantile(top, 0.99, axis=0))
     assert {"q01", "q10", "q50", "q90", "q99"} <= set(total["action"])
-
-
-def test_several_subsets_become_the_tasks_of_one_data_set(stored, tmp_path):
-    release = str(stored["ant-maze-tiny/random/hidden"].folder)
-    [folder] = export(release, "lerobot", tmp_path / "all", ["*/hidden", "*/fixed"], merge=True)
-    assert folder == tmp_path / "all"
-    info = json.loads((folder / "meta/info.json").read_text())
-    lengths = [stored[f"ant-maze-tiny/random/{goal}"].episode(i)[0] for goal in ("fixed", "hidden") for i in range(2)]
-    assert info["total_episodes"] == 4 and info["total_frames"] == sum(lengths)
-    table = pq.read_table(folder / "data/chunk-000/file-000.parquet")
-    np.testing.assert_array_equal(table["index"], np.arange(sum(lengths)))
-    rows = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert [row["tasks"][0].rpartition("(")[2] for row in rows] == ["random, fixed)"] * 2 + ["random, hidden)"] * 2
-    with pytest.raises(DmcvbError, match="merge is not for npz; it is for lerobot"):
-        export(release, "npz", tmp_path / "x", merge=True)
 
 
 def lerobots_features(info):

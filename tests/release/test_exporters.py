@@ -21,8 +21,7 @@ import dmcvb_gen
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.release.export import STAMP, export, registry
-from dmcvb_gen.release.export.publishing import export_format
-from dmcvb_gen.release.export.registry import all_formats, get_format, register_exporter
+from dmcvb_gen.release.export.registry import get_format, register_exporter
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.tfrecord import decode_example, encode_example, offsets, read_example
 from tests.conftest import invoke, roll_out, small_recipe
@@ -163,7 +162,7 @@ def test_an_export_has_the_stored_values_no_place_of_this_machine_and_is_not_wri
         pytest.importorskip(module)
     name = SUBSETS[source.name]
     [folder] = export(str(source), to, tmp_path, [name], (0, 2))
-    assert export_format(folder) == to == json.loads((folder / STAMP).read_text())["format"]
+    assert to == json.loads((folder / STAMP).read_text())["format"]
     subset = dmcvb_gen.open(str(source))[name]
     views = ["pixels"] if name.startswith("walker") else [f"pixels_hidden_goal/{view}" for view in VIEWS]
     for index, (actions, rewards, images) in enumerate(READERS[to](folder)):
@@ -236,12 +235,12 @@ def test_an_export_into_the_release_itself_is_refused(small_release):
 
 
 def test_every_format_of_this_package_has_a_reader_and_its_line_in_the_docs():
-    here = {name: kind for name, kind in all_formats().items() if kind.write.__module__.startswith("dmcvb_gen.")}
-    assert sorted(here) == sorted(READERS)
+    here = [kind for kind in registry.FORMATS.all().values() if kind.write.__module__.startswith("dmcvb_gen.")]
+    assert sorted(kind.name for kind in here) == sorted(READERS)
     page = (Path(__file__).parents[2] / "docs/exports.md").read_text()
-    for name, kind in here.items():
+    for kind in here:
         needs = ", ".join(f"`{module}`" for module in kind.modules)
-        assert re.search(rf"^\| `{name}` \|.*\| {needs} \|$", page, re.MULTILINE)
+        assert re.search(rf"^\| `{kind.name}` \|.*\| {needs} \|$", page, re.MULTILINE)
 
 
 def test_a_format_of_another_package_is_found_by_its_entry_point(maze_release, tmp_path, monkeypatch):
@@ -252,7 +251,7 @@ def test_a_format_of_another_package_is_found_by_its_entry_point(maze_release, t
             if self.name == "broken":
                 raise ImportError("something is missing")
 
-            @register_exporter("returns", mark="returns.txt")
+            @register_exporter("returns")
             def write(source, folder):
                 returns = [str(float(episode.reward.astype(np.float64).sum())) for episode in source]
                 (folder / "returns.txt").write_text("\n".join(returns))
@@ -260,14 +259,14 @@ def test_a_format_of_another_package_is_found_by_its_entry_point(maze_release, t
     formats = registry.FORMATS
     entries = [Entry(name, "their_exporter", formats.group) for name in ("broken", "returns")]
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group: entries if group == formats.group else [])
-    monkeypatch.setattr(formats, "_things", dict(all_formats()))
+    monkeypatch.setattr(formats, "_things", dict(formats.all()))
     monkeypatch.setattr(formats, "_loaded", False)
     invoke("export", maze_release, "--to", "returns", "--out", tmp_path, code=0)
     [subset] = dmcvb_gen.open(str(maze_release)).subsets.values()
     text = (tmp_path / subset.name / "returns.txt").read_text()
     np.testing.assert_allclose([float(line) for line in text.split()], subset.returns, rtol=1e-6)
     with pytest.raises(DmcvbError, match="two formats are called npz"):
-        register_exporter("npz", mark="")(lambda source, folder: None)
+        register_exporter("npz")(lambda source, folder: None)
 
 
 # -- the command --------------------------------------------------------------------------------------------

@@ -1,15 +1,14 @@
 """Export a release's subsets in the formats that other programs read, one folder for each subset."""
 
 import contextlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset.manifest import canonical_json
-from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, sha256_bytes, write_json
-from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader, open_for_reading
+from dmcvb_gen.loaders.release import SubsetReader, open_for_reading
 from dmcvb_gen.options import Local, Location, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
 from dmcvb_gen.release.export.episodes import Source
@@ -29,7 +28,8 @@ class _Work:
     path: str
     storage_options: dict | None
     to: str
-    subsets: tuple[tuple[str, tuple[int, ...]], ...]
+    subset: str
+    episodes: tuple[int, ...]
     folder: Path
     stamp: dict[str, Any]
 
@@ -54,7 +54,6 @@ def export(
     only: Names = (),
     episode_range: Span | None = None,
     *,
-    merge: bool = False,
     workers: Workers = 1,
     storage_options: dict[str, Any] | None = None,
     progress: bool = True,
@@ -69,19 +68,16 @@ def export(
       out (FOLDER): Output folder, one folder per subset.
       only (PATTERN): Export only these subsets.
       episode_range (RANGE): Export only episodes A to B - 1.
-      merge: lerobot: write all subsets as the tasks of one data set.
       workers: Worker processes, one subset each.
       storage_options (NAME=VALUE): Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000.
 
     Raises:
       UnknownNameError: no such format or subset.
-      DmcvbError: a package is not installed, or an option is not for this format.
+      DmcvbError: a package is not installed.
       StoreError: a subset is damaged or not whole (or lacks some of the range), something else lies at `out`, or it
         cannot be written.
     """
     kind, folder, path = get_format(to), Path(local_path(out)).absolute(), str(release)
-    if merge and not kind.merges:
-        raise DmcvbError(f"--merge is not for {to}; it is for lerobot")
     kind.check_installed()  # here, and not first in a worker
     source = open_for_reading(path, storage_options)
     if not is_url(path) and Path(path).resolve() in (folder.resolve(), *folder.resolve().parents):
@@ -90,33 +86,29 @@ def export(
     unions = [name for name in asked if source.parts_of(name)]
     others = [name for name in asked if name not in unions]
     names = [*(source.select(others) if others or not unions else ()), *unions]
-    chosen = tuple((name, _episodes(source[name], episode_range)) for name in names)
-    folders = [folder] if merge else [folder / kind.folder_name(name) for name in names]
-    works = [
-        _Work(path, storage_options, to, part, place, _stamp(source, to, part))
-        for part, place in zip([chosen] if merge else [(one,) for one in chosen], folders, strict=True)
-    ]
+    works = []
+    for name in names:
+        episodes = _episodes(source[name], episode_range)
+        stamp = _stamp(source[name], to, episodes)
+        works.append(_Work(path, storage_options, to, name, episodes, folder / kind.folder_name(name), stamp))
     todo = [work for work in works if not work.done]
     with (
         progress_bar(progress, " episodes", scaled=False) as bar,
         open_pool(workers, tick=bar, most=len(todo)) as pool,
     ):
-        expect(bar, sum(len(episodes) for work in todo for _, episodes in work.subsets))
+        expect(bar, sum(len(work.episodes) for work in todo))
         for work in todo:
             pool.submit(work.folder, _write, work)
         for _ in pool.results():
             pass
-    return folders
+    return [work.folder for work in works]
 
 
-def _stamp(release: ReleaseReader, to: str, subsets: Sequence[tuple[str, tuple[int, ...]]]) -> dict:
+def _stamp(subset: SubsetReader, to: str, episodes: tuple[int, ...]) -> dict[str, Any]:
     """What an export was made from: release, format, and the records of the shards that it reads."""
-    content = []
-    for name, episodes in subsets:
-        shards = release[name].shards((episodes[0], episodes[-1] + 1))
-        digest = sha256_bytes(b"".join(canonical_json(shard.record) for shard in shards))
-        content.append([name, digest, list(episodes)])
-    return dict(release=release.manifest.name, format=to, subsets=content)
+    shards = subset.shards((episodes[0], episodes[-1] + 1))
+    digest = sha256_bytes(b"".join(canonical_json(shard.record) for shard in shards))
+    return dict(release=subset.release.manifest.name, format=to, subsets=[[subset.name, digest, list(episodes)]])
 
 
 def _episodes(subset: SubsetReader, asked: tuple[int, int] | None) -> tuple[int, ...]:
@@ -138,7 +130,7 @@ def _episodes(subset: SubsetReader, asked: tuple[int, int] | None) -> tuple[int,
 def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
     """Write one folder, whole or not at all."""
     release = open_for_reading(work.path, work.storage_options)
-    sources = [Source(release, release[name], list(episodes), tick) for name, episodes in work.subsets]
+    source = Source(release, release[work.subset], list(work.episodes), tick)
     kind, parent = get_format(work.to), work.folder.parent
     with storage_errors(work.folder, "write to"):
         parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +138,7 @@ def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
         with folder_in_the_making(parent, work.folder.name) as made:
             inside = made / work.folder.name
             inside.mkdir()
-            kind.write(sources if kind.merges else sources[0], inside)
+            kind.write(source, inside)
             write_json(inside / STAMP, work.stamp)
             if not work.done:  # another process may have been faster
                 inside.rename(work.folder)

@@ -2,7 +2,7 @@
 
 A format of your own is a function with a decorator, and a line in your package's pyproject.toml::
 
-    @register_exporter("returns", mark="returns.txt")
+    @register_exporter("returns")
     def write(source: Source, folder: Path) -> None:
         returns = [str(episode.reward.sum()) for episode in source]
         (folder / "returns.txt").write_text("\\n".join(returns))
@@ -14,7 +14,7 @@ A format of your own is a function with a decorator, and a line in your package'
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from dmcvb_gen.errors import DmcvbError
@@ -28,18 +28,14 @@ class Format:
 
     Attributes:
       name: name for `--to`.
-      write: writes a subset (`Source`) to an empty folder; a list of subsets if the format `merges` them.
-      mark: pattern of a file that only this format has.
+      write: writes a subset (`Source`) to an empty folder.
       modules: modules that it imports beyond dmcvb-gen's own dependencies.
-      merges: whether one export can have several subsets (`--merge`).
       folder_name: subset -> folder below `--out`; its name by default.
     """
 
     name: str
     write: Callable
-    mark: str
     modules: tuple[str, ...] = ()
-    merges: bool = False
     folder_name: Callable[[str], str] = str
 
     def check_installed(self) -> None:
@@ -69,11 +65,6 @@ def register_exporter(name: str, **facts) -> Callable[[Callable], Callable]:
         return write
 
     return register
-
-
-def all_formats() -> Mapping[str, Format]:
-    """Name -> format, of this package and of all installed ones."""
-    return FORMATS.all()
 
 
 def get_format(name: str) -> Format:

@@ -34,20 +34,6 @@ for one in wanted:
     assert dataset.meta.names["observation.state"][0].endswith(".0"), dataset.meta.names
     print(f"lerobot: {one['subset']} opens, {len(dataset)} frames", flush=True)
 
-mazes = [one for one in wanted if one["subset"].startswith("ant-maze")]
-dataset, start = LeRobotDataset("local/merged", root=work / "merged"), 0
-assert dataset.num_episodes == 2 * len(mazes) and dataset.meta.total_tasks == len(mazes), dataset.meta.tasks
-for one in mazes:
-    stored = np.load(work / one["values"])
-    for index in range(2):
-        item = dataset[start]
-        setting = one["subset"].rpartition("/")[2]
-        assert item["task"] == f"ant-maze-tiny:****/*..*/**** (random, {setting})", item["task"]
-        np.testing.assert_array_equal(item["action"].numpy(), stored[f"action_{index}"][0])
-        start += len(stored[f"action_{index}"])
-assert start == len(dataset)
-print(f"lerobot: {len(mazes)} subsets in one data set, {len(dataset)} frames", flush=True)
-
 dataset, stored = LeRobotDataset("local/causes", root=work / "causes_export"), np.load(work / "causes.npz")
 assert dataset.meta.depth_keys == ["observation.images.depth"], dataset.meta.depth_keys
 for step in (0, 7):

@@ -32,7 +32,8 @@ def export_modalities(work: Path) -> None:
     values = subset.episode(0, list(all_modalities()))
     shown = {n: (one.gray if one.levels else one.color)(values[n]) for n, one in all_modalities().items()}
     np.savez(work / "causes.npz", **shown)
-    export(str(work / "causes"), "lerobot", work / "causes_export", merge=True)
+    [folder] = export(str(work / "causes"), "lerobot", work / "causes_out")
+    folder.rename(work / "causes_export")
 
 
 def main() -> None:
@@ -62,7 +63,6 @@ def main() -> None:
                     [folders[to]] = map(str, export(str(folder), to, work / to, [subset.name]))
             wanted.append({"subset": subset.name, "values": f"{flat}.npz", "hidden": pictures.hide_goal, **folders})
     if "lerobot" in chosen:
-        export(str(work / "maze"), "lerobot", work / "merged", merge=True)
         export_modalities(work)
     (work / "wanted.json").write_text(json.dumps(wanted, indent=1))
 

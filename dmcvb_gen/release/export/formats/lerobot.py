@@ -6,13 +6,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.modalities import modality_of
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
@@ -29,32 +27,27 @@ EPISODES_PER_FILE = 50
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 
-@register_exporter("lerobot", mark="meta/info.json", modules=("pyarrow",), merges=True)
-def write(sources: Sequence[Source], folder: Path) -> None:
+@register_exporter("lerobot", modules=("pyarrow",))
+def write(source: Source, folder: Path) -> None:
     """Write `meta/` (info.json, stats.json, tasks.parquet, episodes), `data/` and a card.
 
-    Several subsets are the tasks of one data set. Modalities that are stored become images of their own: depth is
-    LeRobot's own depth feature in millimeters, segmentation has the number of the geom + 1, both as PNG of 16 bits
-    (`Modality.gray`); flow is in colors (`Modality.color`). info.json says how values are read. The
-    last observation of an episode has no action and is left out, as LeRobot's frames all have one.
-
-    Raises:
-      StoreError: the subsets do not fit into one data set.
+    Modalities that are stored become images of their own: depth is LeRobot's own depth feature in millimeters,
+    segmentation has the number of the geom + 1, both as PNG of 16 bits (`Modality.gray`); flow is in colors
+    (`Modality.color`). info.json says how values are read. The last observation of an episode has no action and is left
+    out, as LeRobot's frames all have one.
     """
-    layout = _Layout(sources)
+    layout = _Layout(source)
     (folder / "meta").mkdir()
     files, statistics, index = _Files(folder, layout), _Statistics(), 0
     rows: list[dict[str, Any]] = []
-    for source, text in zip(sources, _task_texts(sources), strict=True):
-        task = layout.tasks.index(text)
-        for episode in source:
-            columns = layout.frames(episode, len(rows), index, task) | layout.pictures(episode)
-            row = {"episode_index": len(rows), "tasks": [layout.tasks[task]], "length": episode.length}
-            row |= {"dataset_from_index": index, "dataset_to_index": index + episode.length}
-            row |= files.add(columns, len(rows))
-            rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
-            rows[-1] |= statistics.add(columns)
-            index += episode.length
+    for episode in source:
+        columns = layout.frames(episode, len(rows), index) | layout.pictures(episode)
+        row = {"episode_index": len(rows), "tasks": [layout.task], "length": episode.length}
+        row |= {"dataset_from_index": index, "dataset_to_index": index + episode.length}
+        row |= files.add(columns, len(rows))
+        rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
+        rows[-1] |= statistics.add(columns)
+        index += episode.length
     files.close()
     _write_meta(folder, layout, rows, index, statistics)
 
@@ -65,7 +58,7 @@ def _write_meta(folder: Path, layout: _Layout, rows: list[dict], frames: int, st
 
     (folder / EPISODES_PATH).parent.mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist(rows), folder / EPISODES_PATH)
-    tasks = {"task_index": pa.array(range(len(layout.tasks)), pa.int64()), "__index_level_0__": layout.tasks}
+    tasks = {"task_index": pa.array([0], pa.int64()), "__index_level_0__": [layout.task]}
     pandas = {
         "index_columns": ["__index_level_0__"],
         "column_indexes": [],
@@ -80,10 +73,10 @@ def _write_meta(folder: Path, layout: _Layout, rows: list[dict], frames: int, st
     (folder / "meta/stats.json").write_text(json.dumps(statistics.total(), indent=1))
     info = {
         "codebase_version": VERSION,
-        "robot_type": layout.robot,
+        "robot_type": layout.source.subset.task,
         "total_episodes": len(rows),
         "total_frames": frames,
-        "total_tasks": len(layout.tasks),
+        "total_tasks": 1,
         "chunks_size": CHUNK_FILES,
         "data_files_size_in_mb": DATA_MB,
         "video_files_size_in_mb": VIDEO_MB,
@@ -98,54 +91,36 @@ def _write_meta(folder: Path, layout: _Layout, rows: list[dict], frames: int, st
 
 
 def _card(layout: _Layout) -> str:
-    manifest = layout.sources[0].manifest
-    subsets = "\n".join(f"- {source.description}" for source in layout.sources)
+    manifest = layout.source.manifest
     rate = ""
     if layout.fps != layout.rate:
         rate = f"\nThe task takes {layout.rate:.4g} steps a second; timestamps have {layout.fps}, a whole number.\n"
     return (
         f"---\nlicense: {manifest.license.lower()}\ntask_categories:\n- robotics\ntags:\n- LeRobot\nconfigs:\n"
         "- config_name: default\n  data_files: data/*/*.parquet\n---\n\n"
-        f"# {manifest.name} {manifest.version}\n\nA LeRobot data set ({VERSION}) of\n\n{subsets}\n{rate}"
+        f"# {manifest.name} {manifest.version}\n\nA LeRobot data set ({VERSION}): {layout.source.description}.\n{rate}"
     )
-
-
-def _task_texts(sources: Sequence[Source]) -> list[str]:
-    """A text of each source: task and level, and the setting if they have several."""
-    subsets = [source.subset for source in sources]
-    short = [f"{subset.task} ({subset.level})" for subset in subsets]
-    several = len(set(short)) < len(subsets)
-    return [f"{s.task} ({s.level}, {s.setting})" for s in subsets] if several else short
 
 
 class _Layout:
     """Columns of the data set.
 
     Attributes:
-      tasks: their texts; `task_index` counts them. robot: what they have in common.
+      task: text of the one task, task and level.
       rate, fps: steps a second, and the whole number that LeRobot takes for them; timestamps are made of that.
       keys: view -> feature of its pictures.
       modalities: array of depth, segmentation or flow -> feature of its pictures.
       features: features as in info.json.
     """
 
-    def __init__(self, sources: Sequence[Source]):
-        first = sources[0]
-        for source in sources:
-            if _shape(source) != _shape(first):
-                raise StoreError(
-                    f"{source.subset.name} and {first.subset.name} differ in views, size, state, action or "
-                    "modalities, so they do not fit into one data set; merge fewer with --only"
-                )
-        self.sources, self.size = sources, first.subset.record.size
-        self.tasks = list(dict.fromkeys(_task_texts(sources)))
-        tasks = {source.subset.task for source in sources}
-        self.robot = tasks.pop() if len(tasks) == 1 else first.subset.record.family
-        self.rate, self.fps = first.steps_per_second, round(first.steps_per_second)
-        single = len(first.views) == 1
-        self.keys = {view: "observation.image" if single else f"observation.images.{view}" for view in first.views}
-        self.modalities = {name: f"observation.images.{name.replace('/', '_')}" for name in first.modalities}
-        self.features = self._features(first)
+    def __init__(self, source: Source):
+        self.source, self.size = source, source.subset.record.size
+        self.task = f"{source.subset.task} ({source.subset.level})"
+        self.rate, self.fps = source.steps_per_second, round(source.steps_per_second)
+        single = len(source.views) == 1
+        self.keys = {view: "observation.image" if single else f"observation.images.{view}" for view in source.views}
+        self.modalities = {name: f"observation.images.{name.replace('/', '_')}" for name in source.modalities}
+        self.features = self._features(source)
 
     def _features(self, source: Source) -> dict[str, Any]:
         scalar: dict[str, Any] = {"shape": [1], "names": None}
@@ -184,7 +159,7 @@ class _Layout:
             pictures[key] = modality.gray(values) if modality.levels else modality.color(values)
         return pictures
 
-    def frames(self, episode: ExportEpisode, number: int, index: int, task: int) -> dict[str, np.ndarray]:
+    def frames(self, episode: ExportEpisode, number: int, index: int) -> dict[str, np.ndarray]:
         """The columns of an episode but its pictures, each with a row a frame."""
         length, steps = episode.length, np.arange(episode.length)
         return {
@@ -197,7 +172,7 @@ class _Layout:
             "frame_index": steps,
             "episode_index": np.full(length, number),
             "index": index + steps,
-            "task_index": np.full(length, task),
+            "task_index": np.zeros(length, int),
         }
 
     def schema(self) -> pa.Schema:
@@ -219,12 +194,6 @@ class _Layout:
             fields.append(pa.field(name, kind))
             huggingface[name] = told
         return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": huggingface}})})
-
-
-def _shape(source: Source) -> tuple:
-    subset = source.subset
-    sizes = (subset.array(name).shape[-1] for name in ("state", "action"))
-    return source.views, source.modalities, subset.record.size, *sizes, source.steps_per_second
 
 
 class _Files:

@@ -27,7 +27,7 @@ def folder_name(subset: str) -> str:
     return f"{NAMESPACE}/{task}/{level}-{setting}-v0"
 
 
-@register_exporter("minari", mark="data/main_data.hdf5", modules=("minari", "h5py"), folder_name=folder_name)
+@register_exporter("minari", modules=("minari", "h5py"), folder_name=folder_name)
 def write(source: Source, folder: Path) -> None:
     """Write `<folder>/data`, and what minari keeps of the namespaces above it.
 

@@ -15,7 +15,7 @@ CHUNK = 161
 """Steps a chunk."""
 
 
-@register_exporter("replay-buffer", mark="replay_buffer.zarr/.zgroup")
+@register_exporter("replay-buffer")
 def write(source: Source, folder: Path) -> None:
     """Write `replay_buffer.zarr`: `data/img` (step, height, width, 3) uint8 (`data/img_<view>` for several views),
     `data/state`, `data/action`, `data/reward` float32, stored modalities (`data/depth`), and `meta/episode_ends` int64.

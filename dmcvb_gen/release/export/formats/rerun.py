@@ -11,7 +11,7 @@ from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
 
 
-@register_exporter("rerun", mark="episode_*.rrd", modules=("rerun",))
+@register_exporter("rerun", modules=("rerun",))
 def write(source: Source, folder: Path) -> None:
     """Write `episode_<index>.rrd` with the entities `image/<view>`, `state/<field>`, `action`, `reward` and `discount`.
 

@@ -16,7 +16,7 @@ EPISODES_PER_FILE = 50
 _FEATURES = "tensorflow_datasets.core.features"
 
 
-@register_exporter("rlds", mark="dataset_info.json")
+@register_exporter("rlds")
 def write(source: Source, folder: Path) -> None:
     """Write `<version>/`: `dataset_info.json`, `features.json`, the TFRecord shards of a split "train", and in
     `metadata.json` (TFDS's place for what features cannot say) the names of joints and of state's and action's entries.

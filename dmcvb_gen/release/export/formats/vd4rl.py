@@ -24,7 +24,7 @@ def _step_types(rows: int) -> np.ndarray:
     return types
 
 
-@register_exporter("hdf5", mark="data_*.hdf5", modules=("h5py",))
+@register_exporter("hdf5", modules=("h5py",))
 def write_hdf5(source: Source, folder: Path) -> None:
     """Write `data_000.hdf5`, ...: `observation` (row, 3 * view, height, width) uint8, `action`, `reward`, `discount`,
     `state` float32 and `step_type`, episodes one after the other; stored `depth`, `segmentation`, `flow` as well. The
@@ -58,7 +58,7 @@ def _append(file, name: str, value: np.ndarray) -> None:
     file[name][before:] = value
 
 
-@register_exporter("npz", mark="[0-9]*-[0-9]*.npz")
+@register_exporter("npz")
 def write_npz(source: Source, folder: Path) -> None:
     """Write `<episode>-<rows>.npz`: `image` (row, height, width, 3 * view) uint8, `action`, `reward`, `discount`,
     `state` float32, `is_first`, `is_last`, `is_terminal` bool; `depth`, `segmentation`, `flow` if they are stored."""

@@ -13,7 +13,7 @@ from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import register_exporter
 
 
-@register_exporter("zarr", mark="data.zarr/zarr.json")
+@register_exporter("zarr")
 def write(source: Source, folder: Path) -> None:
     """Write `data.zarr` with every array of the subset, (episode, step, ...) or (episode,); "/" in names becomes "_".
 
