@@ -183,9 +183,8 @@ def write_json(path: str | Path, value: Any) -> None:
 
 def copy_file(source: str | Path, target: str | Path) -> None:
     """Copy a file so that `target` is whole or not there, see `write_bytes`."""
-    with Path(source).open("rb") as read, replacing(target) as temporary, temporary.open("wb") as file:
-        while piece := read.read(1 << 20):
-            file.write(piece)
+    with replacing(target) as temporary:
+        shutil.copyfile(source, temporary)
 
 
 @contextlib.contextmanager

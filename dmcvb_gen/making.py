@@ -44,7 +44,6 @@ def rollout(
     distractors: Names = (),
     goals: Names = (),
     episodes: Count | None = None,
-    steps: Count | None = None,
     max_steps: Count | None = None,
     action_repeat: Literal[1, 2, 4] | None = None,
     episode_range: Span | None = None,
@@ -80,7 +79,6 @@ def rollout(
       distractors: none, static, dynamic, or at a strength: dynamic_hard, dynamic_camera0.1. [default: none]
       goals: Mazes: visible, hidden, fixed, or fixed3 for 3 fixed pairs of start and goal. [default: visible]
       episodes: Episodes per subset; fixed goals share them. [default: 20]
-      steps: Steps per subset, instead of --episodes.
       max_steps: Longest episode, in steps, at most 5000. [default: 500, mazes 600, at action repeat 2]
       action_repeat: Control steps for which an action is held. [default: 2]
       episode_range (RANGE): Generate only the shards with episodes A to B - 1.

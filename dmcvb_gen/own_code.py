@@ -100,7 +100,7 @@ def refuse_file(kind: str, name: str) -> None:
     """Raise DmcvbError if a name has a file where its module should be."""
     module, _, function = name.partition(":")
     if module.endswith(".py"):
-        raise DmcvbError(f"{kind} {name} is a file; in its folder, give {Path(module).stem}:{function}")
+        raise DmcvbError(f"{kind} {name} is a file; in its folder, give {Path(module).stem}:{function or 'FUNCTION'}")
 
 
 def import_plugins() -> None:

@@ -16,7 +16,7 @@ from dmcvb_gen.text import format_bytes, pluralize
 
 OPTION_GROUPS = {
     "What": ("recipe", "only", "levels", "distractors", "goals", "behaviour", "sample", "independent", "seed"),
-    "How many": ("episodes", "steps", "max_steps", "action_repeat", "episode_range", "episodes_per_shard"),
+    "How many": ("episodes", "max_steps", "action_repeat", "episode_range", "episodes_per_shard"),
     "Images": ("size", "renderer", "samples", "backgrounds", "split", "pixels"),
     "Where": ("out", "storage_options"),
 }

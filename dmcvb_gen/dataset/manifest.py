@@ -20,6 +20,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 import pydantic
 from typing_extensions import TypedDict
 
@@ -102,6 +103,11 @@ class ArraySpec(_Model):
     attributes: dict[str, Any] = {}
 
     @property
+    def step_bytes(self) -> int:
+        """Bytes of one step, or of one episode's entry, before compression."""
+        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+    @property
     def stored_name(self) -> str:
         """Path below the layer's group: "pixels/top" lies at "pixels_top"; groups "exogenous" and "at84" stay."""
         head, slash, rest = self.name.partition("/")
@@ -134,8 +140,7 @@ class Layer(_Model):
     @pydantic.model_validator(mode="after")
     def _bounded(self) -> Layer:
         for spec in self.arrays:
-            step = math.prod(spec.shape) * _ITEM_BYTES[spec.dtype]
-            rows = self.rows if spec.steps else 1
+            step, rows = spec.step_bytes, self.rows if spec.steps else 1
             chunk = step * (min(spec.chunk_steps or rows, rows) if spec.steps else self.episodes_per_shard)
             if chunk > MAX_CHUNK_BYTES or step * rows * self.episodes_per_shard > MAX_SHARD_BYTES:
                 raise ValueError(f"array {spec.name} of {self.name} has larger shards than any release has")
@@ -160,6 +165,11 @@ class Layer(_Model):
     def episodes_of(self, shard: int) -> range:
         """The episodes of a shard, which is always full."""
         return range(shard * self.episodes_per_shard, (shard + 1) * self.episodes_per_shard)
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one row of an episode before compression: of all arrays that have a value for each step."""
+        return sum(spec.step_bytes for spec in self.arrays if spec.steps)
 
     def array(self, name: str) -> ArraySpec:
         """The spec of one of its arrays, by the reader's name."""
@@ -210,10 +220,6 @@ class ListedLayer(Layer):
 
     shards: int = pydantic.Field(gt=0, le=MAX_SHARDS)
     list: Digest
-
-
-_ITEM_BYTES = {"bool": 1, "uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "int32": 4, "float32": 4}
-_ITEM_BYTES |= {"uint64": 8, "int64": 8, "float64": 8}
 
 
 # -- subsets, recipes, manifest -------------------------------------------------------------------

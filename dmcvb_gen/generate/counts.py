@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass
 
-import numpy as np
-
-from dmcvb_gen.dataset.manifest import Layer
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
 from dmcvb_gen.generate.plan import Plan
@@ -47,18 +43,13 @@ def count(plan: Plan) -> tuple[SubsetCount, ...]:
         for setting in work.settings:
             name, labels = setting.record.name, [setting.labels] if setting.labels else []
             made = [layer for layer in (*below, *labels, *setting.images) if layer.name in work.make]
-            raw[name] += rows * sum(map(_row_bytes, made))
+            raw[name] += rows * sum(layer.row_bytes for layer in made)
             frames[name] += rows * sum(layer.kind == "images" for layer in made)
             below = []
     return tuple(
         SubsetCount(name, chosen - left[name], left[name], frames[name], raw[name])
         for name, chosen in plan.chosen.items()
     )
-
-
-def _row_bytes(layer: Layer) -> int:
-    """Bytes of a row of an episode: all arrays that have a value for each step."""
-    return sum(math.prod(spec.shape) * np.dtype(spec.dtype).itemsize for spec in layer.arrays if spec.steps)
 
 
 def check_room(plan: Plan) -> None:

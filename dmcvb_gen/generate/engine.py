@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset.manifest import ArraySpec, FileRecord, Layer, ShardFile, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ShardFile, ShardRecord, SubsetRecord
 from dmcvb_gen.dataset.schema import decode, encode
 from dmcvb_gen.dataset.writer import file_facts, put, put_back, put_record, wrong_bytes
 from dmcvb_gen.distractor_state import DistractorState
@@ -29,7 +29,6 @@ from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_fi
 from dmcvb_gen.generate.render import (
     distractor_state_of,
     label_arrays,
-    len_rows,
     paint,
     paint_labels,
     renderers,
@@ -284,7 +283,7 @@ def _rendered(
     """Image arrays of one size, one at a time: (plain name, (episode, row, ...))."""
     task, length, rows = get_task(record.task), episodes.length, episodes.physics.shape[1]
     renderer = renderers.get(record, backgrounds)
-    physics = episodes.physics[:, : len_rows(labels)]
+    physics = episodes.physics[:, : labels.background_video.shape[1]]
     modalities: dict[str, list[str]] = {}
     for name, layer in layers.items():
         if modality := layer.makes.get("modality"):
@@ -334,12 +333,12 @@ def _put_file(work: Work, path: str, data: bytes, facts: ShardFile, first_wins: 
     if work.purpose == "make":
         return put(work.store, path, data, first_wins=first_wins)
     if work.purpose == "repair" and _fault(work.store, path, facts):
-        put_back(work.store, FileRecord(path=path, bytes=facts.bytes, sha256=facts.sha256), data)
+        put_back(work.store, facts.at(path), data)
     return facts
 
 
 def _fault(store: Store, path: str, file: ShardFile) -> str | None:
-    wrong = wrong_bytes(store, FileRecord(path=path, bytes=file.bytes, sha256=file.sha256))
+    wrong = wrong_bytes(store, file.at(path))
     return f"{path} {wrong}" if wrong else None
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
-
-import numpy as np
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.engine import WorkResult, run_work
@@ -81,13 +78,7 @@ def check_memory(works: Sequence[Work], workers: Workers) -> None:
 
 def _memory(work: Work) -> int:
     """Bytes that a work holds at its peak: all states, the labels of a setting, and two image arrays."""
-    layers = {layer.name: layer for setting in work.settings for layer in setting.images if layer.name in work.make}
     rows = len(work.episodes) * work.trajectories.rows
-
-    def row_bytes(specs: Sequence) -> list[int]:
-        return [math.prod(spec.shape) * np.dtype(spec.dtype).itemsize for spec in specs if spec.steps]
-
-    labels = [sum(row_bytes(setting.labels.arrays)) for setting in work.settings if setting.labels]
-    images = [max(row_bytes(layer.arrays)) for layer in layers.values()]
-    states = 2 * sum(row_bytes(work.trajectories.arrays))
-    return PROCESS_BYTES + rows * (states + 2 * max(labels, default=0) + 2 * max(images, default=0))
+    labels = max((setting.labels.row_bytes for setting in work.settings if setting.labels), default=0)
+    images = max((layer.row_bytes for layer in work.images), default=0)
+    return PROCESS_BYTES + 2 * rows * (work.trajectories.row_bytes + labels + images)

@@ -265,14 +265,14 @@ def _canonical(setting: str) -> str:
     return DistractorSetting.parse(setting).name if setting.split("_")[0] in distractor_kinds() else setting
 
 
-SUBSET_FIELDS = ("episodes", "steps", "episodes_per_shard", "deterministic", "max_steps", "fixed_goals")
+SUBSET_FIELDS = ("episodes", "episodes_per_shard", "deterministic", "max_steps", "fixed_goals")
 
 
 def override(recipe: Recipe, **changes: Any) -> Recipe:
     """The recipe with other values: its own fields, and fields of all its subsets that they mean something for.
 
     Args:
-      changes: fields of `Recipe` or `SubsetPattern`; `episodes` takes the place of `steps` and the other way round, and
+      changes: fields of `Recipe` or `SubsetPattern`; `episodes` takes the place of `steps`, and
         is shared among the fixed goals of a subset that has some (rounded up); `behaviour`: the policy of the one task
         and level that the recipe has.
 
@@ -281,8 +281,8 @@ def override(recipe: Recipe, **changes: Any) -> Recipe:
     """
     own = {name: value for name, value in changes.items() if name in Recipe.model_fields}
     each = {name: value for name, value in changes.items() if name in SUBSET_FIELDS}
-    if {"episodes", "steps"} & each.keys():
-        each = {"episodes": None, "steps": None} | each
+    if "episodes" in each:
+        each["steps"] = None
     if "behaviour" in changes:
         each["policies"] = {_one_level(recipe): changes["behaviour"]}
     data = recipe.model_dump(mode="json") | own

@@ -176,11 +176,6 @@ def paint(
         yield from images.items()
 
 
-def len_rows(exogenous: DistractorState) -> int:
-    """Rows of labels with leading shape (episode, row)."""
-    return exogenous.background_video.shape[1]
-
-
 def label_arrays(exogenous: DistractorState, length: np.ndarray, rows: int) -> Iterator[tuple[str, np.ndarray]]:
     """The labels under their stored names, rows past an episode's end zero."""
     for name, value in exogenous.items():

@@ -17,7 +17,7 @@ from dmcvb_gen.generate.recipe import (
     narrow,
     override,
 )
-from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own
+from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own, refuse_file
 from dmcvb_gen.spec import (
     FIXED,
     GOAL_MODES,
@@ -33,7 +33,7 @@ from dmcvb_gen.text import as_names
 
 EPISODES = 20
 """Default number of episodes of a subset."""
-_SAME_NAME = ("episodes", "steps", "max_steps", "action_repeat", "episodes_per_shard", "seed", "size", "split")
+_SAME_NAME = ("episodes", "max_steps", "action_repeat", "episodes_per_shard", "seed", "size", "split")
 RECIPE_OPTIONS = {*_SAME_NAME, "levels", "distractors", "goals", "sample", "renderer", "samples", "backgrounds"}
 RECIPE_OPTIONS |= {"behaviour", "independent"}
 """Options that say what to make, not where or how."""
@@ -60,8 +60,6 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
     allow(tasks)  # a person typed these names, so their code may run
     if not tasks and not recipe:
         raise RecipeError("give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes")
-    if given.get("steps") and given.get("episodes"):
-        raise RecipeError("give --episodes or --steps, not both")
     settings, fixed_goals = _settings(given)
     changes = {name: given[name] for name in _SAME_NAME if name in given} | _sources(given)
     changes |= {"fixed_goals": fixed_goals} if fixed_goals else {}
@@ -110,14 +108,11 @@ def behaviour_source(given: str | Path | None) -> str | None:
     """--behaviour as a recipe has it: an absolute path, or "<module>:<function>", whose code may then run.
 
     Raises:
-      RecipeError: it names a Python file.
+      DmcvbError: it names a Python file.
     """
     if given is None:
         return None
-    module, _, function = str(given).partition(":")
-    if module.endswith(".py"):
-        name = f"{Path(module).stem}:{function or 'FUNCTION'}"
-        raise RecipeError(f"--behaviour {given} is a file; in its folder, give --behaviour {name}")
+    refuse_file("--behaviour", str(given))
     if is_own(str(given)):
         allow([str(given)], BEHAVIOURS)  # a person typed its name
         return str(given)

@@ -31,10 +31,10 @@ from dmcvb_gen.dataset.manifest import (
 )
 from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.dataset.schema import image_array, label_arrays, trajectory_arrays
+from dmcvb_gen.dataset.writer import file_facts
 from dmcvb_gen.distractor_state import OPTIONAL_LABELS
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, RecipeError
-from dmcvb_gen.files import sha256_file
 from dmcvb_gen.generate.inputs import BUILTIN
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD, NATIVE, Recipe, SubsetRequest, expand
@@ -156,10 +156,7 @@ def stream_names(layer: Layer) -> tuple[str, ...]:
 
 def file_records(files: Mapping[str, Path]) -> tuple[FileRecord, ...]:
     """Records of files of this machine, by their paths in the release."""
-    return tuple(
-        FileRecord(path=path, bytes=files[path].stat().st_size, sha256=sha256_file(files[path]))
-        for path in sorted(files)
-    )
+    return tuple(file_facts(files[path]).at(path) for path in sorted(files))
 
 
 def _episodes_per_shard(name: str, members: Sequence[SubsetRequest], there: Release | None) -> int:

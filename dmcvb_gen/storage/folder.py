@@ -13,7 +13,7 @@ from typing import BinaryIO
 from filelock import FileLock
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import LASTING, creating, flush_folder, sha256_file
+from dmcvb_gen.files import LASTING, creating, flush_folder, replacing, sha256_file
 from dmcvb_gen.storage.interface import ANY, PIECE, Store
 
 LOCK = ".lock"
@@ -103,7 +103,6 @@ class LocalStore(Store):
             if expected != ANY and expected != (self._version(path) if os.path.lexists(full) else None):
                 return False
             _write_over(data, full)
-        flush_folder(full.parent)
         return True
 
     def _lock(self) -> FileLock:
@@ -123,14 +122,6 @@ def _write(data: bytes | Path, out: BinaryIO) -> None:
 
 
 def _write_over(data: bytes | Path, full: Path) -> None:
-    """Write a file beside another and put it in its place; who holds the lock may use the same name again."""
-    partial = full.with_name(f".{full.name}.partial")
-    partial.unlink(missing_ok=True)
-    try:
-        with partial.open("xb") as file:
-            _write(data, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, full)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Write a file beside another and put it in its place, flushed to the disk."""
+    with replacing(full) as partial, partial.open("wb") as file:
+        _write(data, file)

@@ -38,7 +38,6 @@ ROLLOUTS = [
     ("walker-walk --episodes-per-shard 9999", "--episodes-per-shard is 9999: Input should be less than"),
     ("--recipe=", "'--recipe' is empty; give a place"),
     ("walker-walk --renderer povray", "opengl"),
-    ("walker-walk --episodes 2 --steps 9", "give --episodes or --steps, not both"),
     ("walker-walk --range 5:2", "A < B"),
     ("walker-walk --range ²:³", "A < B"),
     ("walker-walk --seed", "--seed"),
@@ -51,8 +50,8 @@ ROLLOUTS = [
     ("walker-walk --behaviour truncated.safetensors", "not a whole policy file"),
     ("walker-walk --behaviour nan.safetensors", "not finite"),
     ("cheetah-run --behaviour walker.safetensors", "not for cheetah-run"),
-    ("walker-walk --behaviour mine.py", "give --behaviour mine:FUNCTION"),
-    ("walker-walk --behaviour mine.py:swing", "give --behaviour mine:swing"),
+    ("walker-walk --behaviour mine.py", "is a file; in its folder, give mine:FUNCTION"),
+    ("walker-walk --behaviour mine.py:swing", "is a file; in its folder, give mine:swing"),
     ("--recipe dmcvb-mni", "Did you mean 'dmcvb-mini'?"),
     ("--zzz", "`dmcvb-gen rollout --help` lists the options"),
     ("hole.txt", "hole"),
@@ -63,7 +62,6 @@ ROLLOUTS = [
     (f"{MAZE} --goal fixed0x", "unknown goal"),
     (f"{MAZE} --goal fixed0", "unknown goal"),
     (f"{MAZE} --goal fixed100000", "fixed goals"),
-    (f"{MAZE} --steps 100", "episodes"),
     (f"{MAZE} walker-walk", "mazes and locomotion tasks take different settings"),
     (f"{MAZE} --distractor dynamic", "no effect in mazes, which vary in style; ask for --goal"),
     (f"{MAZE} --backgrounds builtin", "no subset shows videos"),
@@ -128,7 +126,7 @@ OTHERS = [
     ("rollout walker-walk --out=", "'--out' is empty; give a place"),
     ("repaint r --out new --samples 3", "'--samples': '3' is not one of"),
 ]
-PLACED = ["info r", "status r", "publish r mine", "fetch r --out mine", "export r --to hdf5 --out mine"]
+PLACED = ["info r", "cluster finish r", "publish r mine", "fetch r --out mine", "export r --to hdf5 --out mine"]
 OTHERS += [(f"{command} --option a=b", "is a folder") for command in PLACED]
 WRITING = ["train-behaviour walker-walk --out", "import . --out"]
 WRITING += ["export r --to hdf5 --out", *(f"{command} r --out" for command in ("validate", "preview", "card"))]
