@@ -13,7 +13,6 @@ EXTRAS = {
     "minari": ("minari",),
     "lerobot": ("pyarrow",),
     "ray": ("ray",),
-    "rerun": ("rerun",),
     "dino": ("timm",),
 }
 """Extra -> the modules that it brings."""
@@ -22,7 +21,6 @@ SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safe
 _PACKAGES = {
     "stable_baselines3": "stable-baselines3",
     "sb3_contrib": "sb3-contrib",
-    "rerun": "rerun-sdk",
     "skfmm": "scikit-fmm",
     "dm_control": "dm-control",
     "PIL": "pillow",

@@ -123,22 +123,6 @@ def read_rlds(folder):
         yield actions, example["steps/reward"][:-1], stacked(example[name] for name in names)
 
 
-def read_rerun(folder):
-    chunk = pytest.importorskip("rerun.chunk")
-    for path in sorted(folder.glob("*.rrd")):
-        found = {}
-        for part in chunk.RrdReader(path).stream().to_chunks():
-            batch = part.to_record_batch()
-            for name in ("Scalars:scalars", "EncodedImage:blob"):
-                if name in batch.schema.names:
-                    order = np.argsort(batch.column("step").to_pylist())
-                    rows = batch.column(name).to_pylist()
-                    found.setdefault(part.entity_path.lstrip("/"), []).extend(rows[i] for i in order)
-        names = in_order(name for name in found if name.startswith("image"))
-        images = stacked([bytes(blob[0]) for blob in found[name]] for name in names)
-        yield found["action"], np.ravel(found["reward"]), images
-
-
 READERS = {
     "hdf5": read_hdf5,
     "npz": read_npz,
@@ -147,7 +131,6 @@ READERS = {
     "minari": read_minari,
     "lerobot": read_lerobot,
     "rlds": read_rlds,
-    "rerun": read_rerun,
 }
 
 

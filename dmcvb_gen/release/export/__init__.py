@@ -64,7 +64,7 @@ def export(
 
     Args:
       release (RELEASE|URL): Folder or URL of the release.
-      to: Format, for example hdf5, minari, lerobot, rlds or rerun.
+      to: Format, for example hdf5, minari, lerobot or rlds.
       out (FOLDER): Output folder, one folder per subset.
       only (PATTERN): Export only these subsets.
       episode_range (RANGE): Export only episodes A to B - 1.
