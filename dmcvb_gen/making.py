@@ -13,7 +13,6 @@ from annotated_types import Gt, Lt
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import (
     Count,
-    GoalPictures,
     Local,
     Location,
     Names,
@@ -200,7 +199,6 @@ def paint(
     episode_range: Span | None = None,
     size: Count | None = None,
     views: Names | None = None,
-    goal: GoalPictures | None = None,
     workers: Workers | None = None,
     backgrounds: Location | None = None,
     progress: bool = True,
@@ -213,7 +211,6 @@ def paint(
       episode_range (RANGE): Use only the shards with episodes A to B - 1.
       size: Width and height, 8 to 1024 pixels. [default: the manifest's]
       views (A,B): Mazes: render only these views, e.g. egocentric. [default: all]
-      goal: Mazes: render only images with, or without, the goal. [default: both]
       workers: Worker processes. [default: a core each, as far as memory allows]
       backgrounds (FOLDER): Folder of the background videos, if the release has no copies.
 
@@ -224,7 +221,7 @@ def paint(
     from dmcvb_gen.generate.request import background_source
     from dmcvb_gen.storage.places import local_path
 
-    wanted = Wanted(size, None if views is None else as_names(views), goal)
+    wanted = Wanted(size, None if views is None else as_names(views))
     videos = None if backgrounds is None else background_source(backgrounds)
     with progress_bar(progress, " frames") as bar:
         given: dict[str, Any] = dict(workers=workers, backgrounds=videos, progress=bar)

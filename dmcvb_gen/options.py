@@ -42,7 +42,6 @@ Seed = Annotated[int, Ge(0)]
 Samples = Literal[1, 2, 4, 8]
 Span = Annotated[tuple[int, int], RANGE]
 """(first, last + 1)."""
-GoalPictures = Literal["visible", "hidden"]
 Precision = Literal["auto", "float32", "bfloat16"]
 Split = Literal["train", "val"]
 

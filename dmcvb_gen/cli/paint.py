@@ -16,7 +16,7 @@ from dmcvb_gen.text import pluralize
 def paint(release, as_json, **options):
     """Render the images of a release stored without pixels, and compare them with their known digests.
 
-    Rerun the command to resume. With --size, --views or --goal it becomes another release,
+    Rerun the command to resume. With --size or --views it becomes another release,
     and its manifest says so. Other distractors or renderers: `dmcvb-gen repaint`. Exit code 1 if images differ
     from the known ones.
 
@@ -63,12 +63,6 @@ def _painted(place, done):
     rendered = f"Rendered {pluralize(done.shards, 'shards')}. {_compared(done)}."
     yield f"{place}: {rendered if done.shards else 'All local shards have images already.'}"
     yield from (f"  differs: {name}" for name in done.differing[:10])
-    if done.differing:
-        yield (
-            "  The notes above name what differs from the machine of the release."
-            if done.drift
-            else "  Versions and processor are the same as the release's."
-        )
 
 
 def _compared(done) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shlex
 
 import click
 
@@ -12,7 +11,7 @@ from dmcvb_gen.cli.common import answer, json_option, print_json, print_table, r
 from dmcvb_gen.cli.options import command_of, parse_part
 from dmcvb_gen.options import progress_bar
 from dmcvb_gen.storage.places import is_url
-from dmcvb_gen.text import format_bytes, pluralize
+from dmcvb_gen.text import format_bytes, pluralize, quoted
 
 OPTION_GROUPS = {
     "What": ("recipe", "only", "levels", "distractors", "goals", "behaviour", "sample", "independent", "seed"),
@@ -84,7 +83,7 @@ def begin(as_json, progress, **options):
 
     plan = _plan(options)
     start(plan, command="cluster begin")
-    place = shlex.quote(str(plan.store.place))
+    place = quoted(plan.store.place)
     begun = f"begun, {pluralize(len(plan.works), 'shards')} to make: dmcvb-gen cluster part {place} 1/N to N/N"
     answer(as_json, {"out": plan.store.place, "shards": len(plan.works)}, f"{plan.store.place}: {begun}")
 
@@ -155,7 +154,7 @@ def _run(plan, workers, as_json, whole=True):
     release, steps, place = made.release, made.steps, plan.store.place
     complete = whole and not missing_subsets(release)
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))
-    named = shlex.quote(str(place))
+    named = quoted(place)
     state = "complete" if complete else f"not complete yet (dmcvb-gen rollout --out {named} --dry-run shows the rest)"
     if not whole:
         state = f"finished with `dmcvb-gen cluster finish {named}` when all parts are done"

@@ -601,7 +601,7 @@ def build_manifest(
         recipes=tuple(recipe.sha256 for recipe in used),
         inputs=tuple(inputs[path] for path in sorted(inputs)),
         layers=tuple(
-            ListedLayer(**_facts(layers[name]), shards=len(each.shards), list=sha256_bytes(canonical_json(each)))
+            ListedLayer(**layer_facts(layers[name]), shards=len(each.shards), list=sha256_bytes(canonical_json(each)))
             for name, each in made.items()
         ),
         subsets=tuple(subsets[name] for name in sorted(subsets)),
@@ -630,7 +630,8 @@ def _described(recipe: Resolved) -> tuple[Any, ...]:
     return bool(recipe.recipe), recipe.derived, *(getattr(recipe, name) for name in SAID)
 
 
-def _facts(layer: Layer) -> dict[str, Any]:
+def layer_facts(layer: Layer) -> dict[str, Any]:
+    """The fields of a layer, without what a finished release says of it."""
     return {name: getattr(layer, name) for name in Layer.model_fields}
 
 

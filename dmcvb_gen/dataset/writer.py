@@ -61,13 +61,12 @@ PROVENANCE_BYTES = 2**20
 ROW_LAYOUT = "row t: observation t, action t, reward of action t; row `length`: the last observation alone"
 
 
-def put(store: Store, path: str, data: bytes | Path, *, first_wins: bool = False, move: bool = False) -> ShardFile:
+def put(store: Store, path: str, data: bytes | Path, *, first_wins: bool = False) -> ShardFile:
     """Create a file, or adopt the equal one that is there.
 
     Args:
       data: its bytes, or the path of a local file.
       first_wins: adopt whatever is there, for images of a renderer that does not promise bits.
-      move: the local file may become the stored one.
 
     Returns:
       Size and SHA-256 of the file that is there now.
@@ -76,7 +75,7 @@ def put(store: Store, path: str, data: bytes | Path, *, first_wins: bool = False
       StoreError: a file with other bytes is there, or it cannot be written.
     """
     mine = file_facts(data)
-    if store.create(path, data, move=move):
+    if store.create(path, data):
         return mine
     there = ShardFile(bytes=store.size(path) or 1, sha256=store.sha256(path, MAX_SHARD_BYTES))
     if there == mine or first_wins:

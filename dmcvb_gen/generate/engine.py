@@ -144,7 +144,7 @@ def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> W
       StoreError: what is read is damaged, other bytes are there, or the place is full or cannot be written.
     """
     first = work.settings[0].record
-    if work.simulates:
+    if work.trajectories.name in work.make:
         episodes = simulated_episodes(work, first, threads)
         outcomes = [_settle(work, work.trajectories, episodes.arrays.items())]
     else:

@@ -15,7 +15,7 @@ from typing import Any
 
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import Layer, ListedLayer, Resolved, SubsetRecord, layer_order
+from dmcvb_gen.dataset.manifest import SAID, Layer, Resolved, SubsetRecord, layer_facts, layer_order
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.dataset.writer import begin, finish, read_provenance, write_provenance
 from dmcvb_gen.errors import DmcvbError, StoreError
@@ -25,9 +25,7 @@ from dmcvb_gen.generate.resolve import all_pictures, image_layers, rendering_fac
 from dmcvb_gen.generate.works import can_be_rendered, chosen_subsets, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
-from dmcvb_gen.spec import HIDDEN
 from dmcvb_gen.storage.store import Store, open_store
-from dmcvb_gen.tasks import get_task
 from dmcvb_gen.text import printable
 
 _log = logging.getLogger(__name__)
@@ -40,7 +38,6 @@ class Wanted:
     Attributes:
       size: pixels a side.
       views: of mazes, only these.
-      goal: of mazes, only the images with the goal ("visible") or without it ("hidden").
 
     Raises:
       DmcvbError: a size that no renderer takes, or no view at all.
@@ -48,7 +45,6 @@ class Wanted:
 
     size: int | None = None
     views: tuple[str, ...] | None = None
-    goal: str | None = None
 
     def __post_init__(self) -> None:
         if self.size is not None:
@@ -64,8 +60,6 @@ class Wanted:
         """
         views = Pictures(record.views).select(self.views).views
         names = {*Pictures(views).arrays, *Pictures(views, hide_goal=True).arrays}
-        if self.goal is not None:
-            names &= {*Pictures(views, hide_goal=self.goal == HIDDEN).arrays}
         return tuple(name for name in all_pictures(record) if name in names)
 
 
@@ -112,7 +106,7 @@ def paint_release(
     """
     store, wanted = place if isinstance(place, Store) else open_store(place), wanted or Wanted()
     release = Release.open(store)
-    records = _paintable(release, only, wanted)
+    records = _paintable(release, only)
     root = local_inputs(store, release.inputs_of([record.name for record in records]))
     sources = {record.name: background_source(root, record, backgrounds) for record in records}
     layers = {record.name: _layers_of(release, record, wanted, sources[record.name]) for record in records}
@@ -138,13 +132,11 @@ def paint_release(
     return RenderResult(finish(store), len(outcomes), known, tuple(differing), drift)
 
 
-def _paintable(release: Release, only: Sequence[str], wanted: Wanted) -> list[SubsetRecord]:
-    """The subsets to paint, once all that can be wrong with the request was looked at."""
+def _paintable(release: Release, only: Sequence[str]) -> list[SubsetRecord]:
+    """The subsets to paint: those that were not imported."""
     records = [record for record in chosen_subsets(release, only) if not record.imported]
     if not records:
         raise StoreError(f"{release.place} was imported and has no physics states to paint from")
-    if wanted.goal and not any(get_task(record.task).goal_geoms for record in records):
-        raise DmcvbError("--goal is for ant-maze tasks, and none of them is selected; remove it")
     return records
 
 
@@ -173,15 +165,13 @@ def _recipe_with(release: Release, records: Iterable[SubsetRecord], layers: Mapp
 
 def recipe_after(release: Release, layers: Iterable[Layer], subsets: Iterable[SubsetRecord], **facts: Any) -> Resolved:
     """The recipe of other layers and subsets with a release's name, license and so on; `facts`: what else it says."""
-    kept = {name: getattr(release.manifest, name) for name in ("name", "version", "license", "authors", "description")}
+    kept = {name: getattr(release.manifest, name) for name in SAID}
     return Resolved(**(kept | facts), layers=tuple(layers), subsets=tuple(subsets))
 
 
 def bare(layer: Layer) -> Layer:
     """A layer without what a finished release says of it."""
-    if not isinstance(layer, ListedLayer):
-        return layer
-    return Layer(**{name: getattr(layer, name) for name in Layer.model_fields})
+    return Layer(**layer_facts(layer))
 
 
 def render_differences(

@@ -29,7 +29,6 @@ from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import (
     ANT_MAZE,
     FIXED,
-    GOAL_MODES,
     LOCOMOTION,
     DistractorSetting,
     SubsetSpec,
@@ -188,9 +187,8 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
 
 
 def _shards(request: SubsetRequest) -> int:
-    return -(
-        -request.episodes // (request.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[get_task(request.task).family])
-    )
+    most = request.episodes_per_shard or DEFAULT_EPISODES_PER_SHARD[get_task(request.task).family]
+    return -(-request.episodes // most)
 
 
 def _request(pattern: SubsetPattern, task: Task, spec: SubsetSpec) -> SubsetRequest:
@@ -239,16 +237,14 @@ def narrow(
     """
     wanted = {"tasks": tasks, "levels": levels, "settings": settings}
     for field, given in wanted.items():
-        known = {value for pattern in recipe.subsets for value in getattr(pattern, field)}
-        if field == "settings":
-            known |= {DistractorSetting.parse(value).name for value in known - set(GOAL_MODES)}
+        known = {_canonical(value) for pattern in recipe.subsets for value in getattr(pattern, field)}
         for value in given:
             if value not in known:
                 raise UnknownNameError(f"{field[:-1]} of recipe {recipe.name}", value, known)
     patterns = []
     for pattern in recipe.subsets:
         kept = {
-            field: tuple(v for v in getattr(pattern, field) if not given or v in given or _canonical(v) in given)
+            field: tuple(v for v in getattr(pattern, field) if not given or _canonical(v) in given)
             for field, given in wanted.items()
         }
         if all(kept.values()):

@@ -21,6 +21,7 @@ from typing import Any
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import (
     POLICIES,
+    SAID,
     VIDEOS,
     FileRecord,
     Layer,
@@ -108,11 +109,7 @@ def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -
             subsets.append(record.model_copy(update={"layers": tuple(layer.name for layer in made)}))
     _tell_of_held_actions(recipe, subsets)
     resolved = Resolved(
-        name=recipe.name,
-        version=recipe.version,
-        license=recipe.license,
-        authors=recipe.authors,
-        description=recipe.description,
+        **{name: getattr(recipe, name) for name in SAID},
         recipe=_without_local_paths(recipe, policies, subsets),
         inputs=file_records(files),
         layers=tuple(layers.values()),

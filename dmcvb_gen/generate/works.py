@@ -81,11 +81,6 @@ class Work:
         views = {name.replace("pixels_hidden_goal", "pixels") for name in names}
         return (self.steps + len(self.episodes)) * max(len(views), 1)
 
-    @property
-    def simulates(self) -> bool:
-        """Whether its episodes are simulated."""
-        return self.trajectories.name in self.make
-
 
 def works_of(
     release: Release,

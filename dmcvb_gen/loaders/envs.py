@@ -28,7 +28,6 @@ from dmcvb_gen.rendering import make_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
-    HIDDEN,
     VISIBLE,
     GoalMode,
     SubsetSpec,
@@ -66,7 +65,6 @@ class Scene:
       action_repeat: control steps for which an action is held; give that of the data.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
       fixed_goals: number of pairs of start and goal under "fixed"; an episode takes the next one.
-      goal: of mazes: pictures with the goal ("visible") or without it ("hidden"), whatever the distractor says.
       goal_pair: under "fixed": this pair in all episodes.
       goal_seed: under "fixed": the seed that the pairs are drawn from, as a recipe's seed.
       threads: threads of the simulation; the result does not depend on them.
@@ -85,7 +83,6 @@ class Scene:
     modalities: str | Sequence[str] = ()
     action_repeat: Literal[1, 2, 4] = 2
     max_steps: Count | None = None
-    goal: Literal["visible", "hidden"] | None = None
     fixed_goals: Count = FIXED_GOALS
     goal_pair: Index | None = None
     goal_seed: Index = 0
@@ -104,8 +101,6 @@ class Scene:
     def check(self) -> None:
         """Raises DmcvbError for a field that has no effect, or none for this task."""
         spec, unused = self.spec(), []
-        if not is_maze(get_task(self.task).id):
-            unused.append("goal")
         if spec.goal is not GoalMode.FIXED:
             unused += ["fixed_goals", "goal_pair", "goal_seed"]
         elif self.goal_pair is not None and self.goal_pair >= self.fixed_goals != FIXED_GOALS:
@@ -149,8 +144,7 @@ class _Stage:
         self.task, self.count = get_task(scene.task).at(scene.action_repeat), count
         self.size, self.split = scene.size, scene.split
         self.setting = spec.distractor
-        hide = scene.goal == HIDDEN if scene.goal else spec.hides_goal
-        self.pictures = Pictures(self.task.views, hide).select(scene.views)
+        self.pictures = Pictures(self.task.views, spec.hides_goal).select(scene.views)
         self.modalities = as_names(scene.modalities)
         self.max_steps = scene.max_steps or self.task.evaluation_steps
         self.pairs = _pairs(self.task, scene) if spec.goal is GoalMode.FIXED else None

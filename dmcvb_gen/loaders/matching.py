@@ -8,7 +8,7 @@ from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.inputs import BUILTIN, video_source
 from dmcvb_gen.loaders.envs import DistractedEnv, DistractedVectorEnv
-from dmcvb_gen.spec import FIXED, HIDDEN, VISIBLE
+from dmcvb_gen.spec import FIXED
 from dmcvb_gen.tasks import ACTION_REPEAT
 
 
@@ -46,8 +46,6 @@ def environment_options(subset: Subset, split: str) -> dict[str, Any]:
         options["renderer"] = record.renderer["name"]
     if maze:
         options["views"] = list(shown(subset).views)
-        if record.hidden_goal != (record.setting != VISIBLE):  # `paint --goal` decides it, too
-            options["goal"] = HIDDEN if record.hidden_goal else VISIBLE
     if own_videos(subset):
         options["own_videos"] = (record.backgrounds or {}).get("digest")
     if record.setting == FIXED:

@@ -87,7 +87,7 @@ class ObjectStore(Store):
 
     # -- writing ----------------------------------------------------------------------------------
 
-    def _create(self, path: str, data: bytes | Path, move: bool) -> None:
+    def _create(self, path: str, data: bytes | Path) -> None:
         self._put_new(path, data)
         if self.place not in _heeding:
             try:  # once more: a store that heeds If-None-Match refuses it

@@ -13,7 +13,7 @@ from typing import BinaryIO
 from filelock import FileLock
 
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import LASTING, creating, flush_folder, replacing, sha256_file
+from dmcvb_gen.files import LASTING, creating, flush_folder, sha256_file
 from dmcvb_gen.storage.interface import ANY, PIECE, Store
 
 LOCK = ".lock"
@@ -76,17 +76,12 @@ class LocalStore(Store):
                     found[path.relative_to(self.folder).as_posix()] = status.st_size
         return found
 
-    def _create(self, path: str, data: bytes | Path, move: bool) -> None:
+    def _create(self, path: str, data: bytes | Path) -> None:
         full = self._at(path)
         full.parent.mkdir(parents=True, exist_ok=True)
         try:
-            if move and isinstance(data, Path):
-                with data.open("rb") as file:
-                    os.fsync(file.fileno())
-                os.link(data, full)
-            else:
-                with creating(full) as out:
-                    _write(data, out)
+            with creating(full) as out:
+                _write(data, out)
         except OSError as error:
             if error.errno in LASTING:
                 raise
@@ -103,6 +98,7 @@ class LocalStore(Store):
             if expected != ANY and expected != (self._version(path) if os.path.lexists(full) else None):
                 return False
             _write_over(data, full)
+        flush_folder(full.parent)
         return True
 
     def _lock(self) -> FileLock:
@@ -122,6 +118,14 @@ def _write(data: bytes | Path, out: BinaryIO) -> None:
 
 
 def _write_over(data: bytes | Path, full: Path) -> None:
-    """Write a file beside another and put it in its place, flushed to the disk."""
-    with replacing(full) as partial, partial.open("wb") as file:
-        _write(data, file)
+    """Write a file beside another and put it in its place; who holds the lock may use the same name again."""
+    partial = full.with_name(f".{full.name}.partial")
+    partial.unlink(missing_ok=True)
+    try:
+        with partial.open("xb") as file:
+            _write(data, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, full)
+    finally:
+        partial.unlink(missing_ok=True)

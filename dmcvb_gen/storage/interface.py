@@ -87,7 +87,7 @@ class Store(abc.ABC):
         """Every file below a folder ("" for all): path -> bytes. Raises FileNotFoundError."""
         raise StoreError(f"{self.place} gives no list of its files; fetch the release first")
 
-    def _create(self, path: str, data: bytes | Path, move: bool) -> None:
+    def _create(self, path: str, data: bytes | Path) -> None:
         """Write a file as one atomic operation. Raises FileExistsError."""
         raise self._read_only()
 
@@ -228,19 +228,18 @@ class Store(abc.ABC):
 
     # -- writing ----------------------------------------------------------------------------------
 
-    def create(self, path: str, data: bytes | Path, move: bool = False) -> bool:
+    def create(self, path: str, data: bytes | Path) -> bool:
         """Put a file if nothing is there; False, and nothing is written, if something is.
 
         Args:
           data: its bytes, or a local file that has them.
-          move: the local file is the caller's own and may become the stored file itself.
 
         Raises:
           StoreError: no room, no right, no bucket, or see the class.
         """
         with self._errors(path, "write to"):
             try:
-                self._create(path, data, move)
+                self._create(path, data)
             except FileExistsError:
                 return False
         return True

@@ -111,20 +111,6 @@ def test_pictures_are_those_that_the_store_has_for_the_same_physics_and_labels(s
         np.testing.assert_array_equal(env._stage.observe()["pixels"][0], episode["pixels"][step])
 
 
-def test_a_mazes_goal_is_shown_or_not_as_asked_whatever_the_setting():
-    maze, options = "ant-maze-empty7x7", {"views": ["top"], "size": 32}
-    seen = {
-        (setting, goal): DistractedEnv(maze, setting, goal=goal, **options).reset(seed=1)[0]["pixels"]
-        for setting in ("visible", "hidden")
-        for goal in (None, "visible", "hidden")
-    }
-    for setting, goal in seen:
-        np.testing.assert_array_equal(seen[setting, goal], seen[goal or setting, None])
-    assert (seen["visible", None] != seen["hidden", None]).any()
-    hidden, seen = (DistractedEnv(maze, "fixed", goal=goal, **options).reset(seed=1)[0] for goal in (None, "visible"))
-    assert (hidden["pixels"] != seen["pixels"]).any()
-
-
 def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
     maze, views = "ant-maze-empty7x7", ["top"]
     env = gymnasium.make(f"dmcvb_gen/{maze}-fixed-v0", views=views, goal_seed=3, size=48)
@@ -197,7 +183,6 @@ MISTAKES = [
     (("walker-walk",), {"siz": 16}, "siz is 16: Unexpected keyword argument"),
     (("walker-walk", "none"), {"backgrounds": "videos"}, "backgrounds has no effect.*remove backgrounds"),
     ((MAZE, "visible"), {"goal_pair": 0}, "no effect.*remove goal_pair"),
-    (("walker-walk",), {"goal": "hidden"}, "no effect.*remove goal"),
     (("walker-walk",), {"max_steps": 0}, "max_steps is 0"),
     ((MAZE, "fixed"), {"goal_pair": -1}, "goal_pair is -1"),
     ((MAZE, "fixed"), {"goal_pair": 7, "fixed_goals": 3}, "goal_pair is 7; give 0 to 2"),

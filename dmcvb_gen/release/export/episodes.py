@@ -98,16 +98,11 @@ class Source:
     @property
     def names(self) -> dict[str, list[str]]:
         """Array ("state", "action") -> a name for each of its entries."""
-        state = [f"{name}.{i}" for name, (first, last) in self.fields.items() for i in range(last - first)]
+        fields = sorted(self.subset.spec("state").attributes["fields"].items(), key=lambda field: field[1])
+        state = [f"{name}.{i}" for name, (first, last) in fields for i in range(last - first)]
         size = self.subset.array("action").shape[-1]
         actuators = self.subset.record.actuators or [""] * size
         return {"state": state, "action": [name or f"actuator.{i}" for i, name in enumerate(actuators)]}
-
-    @property
-    def fields(self) -> dict[str, tuple[int, int]]:
-        """Field of the state -> its first entry, and the one after its last; in their order."""
-        fields = self.subset.spec("state").attributes["fields"]
-        return dict(sorted(fields.items(), key=lambda field: field[1]))
 
     @property
     def joints(self) -> list[str]:
