@@ -42,24 +42,23 @@ def info(path, options, as_json):
                 f"{subset['episodes']:,}{planned}",
                 f"{subset['steps']:,}",
                 format_bytes(subset["bytes"]),
-                f"{subset['bytes_per_step']:,.0f}",
                 *(f"{subset['returns'][key]:.1f}" for key in statistics),
                 "" if subset["normalized"] is None else f"{subset['normalized']:.0f}",
             )
         )
         if paper := subset["paper"]:
             numbers = (f"{paper[key]:.1f}" for key in statistics)
-            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", "", *numbers, ""))
+            rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", *numbers, ""))
     title = f"{facts['name']} {facts['version']}"
     if facts["part"]:
         title = f"part of {title} ({facts['digest'][:12]})"
     elif not facts["complete"]:
         title += " (not complete)"
     print_table(
-        ("subset", "episodes", "steps", "size", "B/step", *statistics, "score"),
+        ("subset", "episodes", "steps", "size", *statistics, "score"),
         rows,
         title=title,
-        optional=(("B/step",), ("p25", "p75"), ("min", "max"), ("score",), ("size",), ("median",)),
+        optional=(("p25", "p75"), ("min", "max"), ("score",), ("size",), ("median",)),
     )
     click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}")
     if facts["missing"]:

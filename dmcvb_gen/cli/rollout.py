@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 
 import click
 
@@ -150,16 +151,17 @@ def _run(plan, workers, as_json, whole=True):
     from dmcvb_gen.generate.works import missing_subsets
 
     with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
-        made = run_plan(plan, workers, bar, finishing=whole)
-    release, steps, place = made.release, made.steps, plan.store.place
+        started = time.monotonic()
+        release, steps = run_plan(plan, workers, bar, finishing=whole)
+    seconds, place = time.monotonic() - started, plan.store.place
     complete = whole and not missing_subsets(release)
-    facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(made.seconds, 2))
+    facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(seconds, 2))
     named = quoted(place)
     state = "complete" if complete else f"not complete yet (dmcvb-gen rollout --out {named} --dry-run shows the rest)"
     if not whole:
         state = f"finished with `dmcvb-gen cluster finish {named}` when all parts are done"
-    rate = f" at {steps / made.seconds:,.0f} steps/s" if steps else ""
-    done = f"{place}: {steps:,} steps in {made.seconds:.0f} s{rate}; the release is {state}."
+    rate = f" at {steps / seconds:,.0f} steps/s" if steps else ""
+    done = f"{place}: {steps:,} steps in {seconds:.0f} s{rate}; the release is {state}."
     images = not is_url(str(place)) and any(layer.kind == "images" for layer in release.layers.values())
     look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if images else "")
     answer(as_json, facts, done, *([look] if whole else []))

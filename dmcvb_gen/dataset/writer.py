@@ -142,14 +142,11 @@ def check_agree(recipes: Sequence[Resolved]) -> None:
 # -- shards ---------------------------------------------------------------------------------------
 
 
-def put_shard(
-    store: Store, layer: Layer, shard: int, arrays: Iterable[tuple[str, np.ndarray]], *, first_wins: bool = False
-) -> ShardRecord:
+def put_shard(store: Store, layer: Layer, shard: int, arrays: Iterable[tuple[str, np.ndarray]]) -> ShardRecord:
     """Write the arrays of a layer's shard, then its record.
 
     Args:
       arrays: (name, (episode of the shard, ...)) pairs of all arrays of the layer, taken one after the other.
-      first_wins: see `put`.
 
     Raises:
       StoreError: see `put`; arrays are missing; another job's record is there.
@@ -159,13 +156,13 @@ def put_shard(
         given.add(name)
         data = encode(layer, specs[name], values)
         if data is not None:
-            files[name] = put(store, layer.file_path(specs[name], shard), data, first_wins=first_wins)
+            files[name] = put(store, layer.file_path(specs[name], shard), data)
     if lacking := set(specs) - given:
         raise StoreError(f"shard {shard} of {layer.name} was made without {min(lacking)}")
-    return put_record(store, layer, shard, ShardRecord(key=layer.job_key(shard), files=files), first_wins=first_wins)
+    return put_record(store, layer, shard, ShardRecord(key=layer.job_key(shard), files=files))
 
 
-def put_record(store: Store, layer: Layer, shard: int, record: ShardRecord, *, first_wins: bool = False) -> ShardRecord:
+def put_record(store: Store, layer: Layer, shard: int, record: ShardRecord) -> ShardRecord:
     """Put the record of a shard whose files are there: from now on the shard exists.
 
     Raises:
@@ -176,11 +173,10 @@ def put_record(store: Store, layer: Layer, shard: int, record: ShardRecord, *, f
         return record
     where = f"{store.place}/{path}"
     there = check_record(parse(ShardRecord, store.read(path, record_bytes_limit(layer)), where), layer, shard, where)
-    if there != record and not first_wins:
-        name = next(n for n in sorted({*there.files, *record.files}) if there.files.get(n) != record.files.get(n))
+    if there != record:
         raise StoreError(
-            f"{where} has other bytes of {name} (made by {makers(store)}) than {_versions(environment())} makes; use "
-            "those versions, or choose another place"
+            f"{where} names other files (made by {makers(store)}) than {_versions(environment())} makes; use those "
+            "versions, or choose another place"
         )
     return there
 

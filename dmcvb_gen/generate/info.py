@@ -51,7 +51,6 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 complete=len(subset.episodes) == subset.record.episodes,
                 steps=subset.steps,
                 bytes=subset.bytes,
-                bytes_per_step=subset.bytes / max(subset.steps, 1),
                 size=subset.record.size,
                 images=any(layer.kind == "images" for layer in subset.layers),
                 renderer=subset.record.renderer.get("name"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,6 @@ from dmcvb_gen.options import refuse
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import as_names
-
-Options = Mapping[str, Any]
-"""Arguments of `rollout` by name; None, False or empty if they are not given."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +51,8 @@ class Plan:
         return "frames" if any(work.images for work in self.works) else "steps"
 
 
-def plan_of(options: Options) -> Plan:
-    """The plan of the arguments of `rollout`.
+def plan_of(options: Mapping[str, Any]) -> Plan:
+    """The plan of the arguments of `rollout` by name; None, False or empty if they are not given.
 
     Raises:
       DmcvbError: anything that would fail later, found before any work.
@@ -67,7 +63,7 @@ def plan_of(options: Options) -> Plan:
     return make_plan(request, store, as_names(options["only"]), options["episode_range"], pixels=options["pixels"])
 
 
-def request_of(options: Options) -> Recipe | None:
+def request_of(options: Mapping[str, Any]) -> Recipe | None:
     """The recipe that the options ask for; None resumes the release at `out`.
 
     Raises:
@@ -141,28 +137,13 @@ def start(plan: Plan, other_versions: bool = False, command: str = "rollout") ->
         write_provenance(plan.store, command)
 
 
-@dataclass(frozen=True)
-class RolloutResult:
-    """The result of running a plan.
-
-    Attributes:
-      release: the release as it is now.
-      steps: transitions that were made now.
-      seconds: on the clock.
-    """
-
-    release: Release
-    steps: int
-    seconds: float
-
-
 def run_plan(
     plan: Plan,
     workers: Workers | None = None,
     progress: ProgressCallback = ignore,
     *,
     finishing: bool = True,
-) -> RolloutResult:
+) -> tuple[Release, int]:
     """Make every shard of a plan, and write the manifest of subsets that are whole.
 
     Args:
@@ -171,11 +152,11 @@ def run_plan(
       progress: called with the number of frames rendered since the last call.
       finishing: write the manifest; False for a part, because other machines make the rest.
 
+    Returns:
+      The release as it is now, and the number of transitions that were made now.
+
     Raises:
       StoreError: the disk is full, or another machine has put other bytes.
     """
-    started, steps = time.monotonic(), 0
-    for result in run_works(plan.works, workers, progress):
-        steps += result.steps
-    release = finish(plan.store) if finishing else plan.release
-    return RolloutResult(release, steps, time.monotonic() - started)
+    steps = sum(result.steps for result in run_works(plan.works, workers, progress))
+    return finish(plan.store) if finishing else plan.release, steps

@@ -62,14 +62,10 @@ def episode_strip(subset: Subset, episode: int, columns: int = SHEET_COLUMNS, sc
     return np.concatenate([_label(caption, picture.shape[1]), picture])
 
 
-def contact_sheet(
-    subsets: Sequence[Subset], episodes: int = 4, columns: int = SHEET_COLUMNS, scale: int = 2
-) -> np.ndarray:
+def contact_sheet(subsets: Sequence[Subset], episodes: int = 4, scale: int = 2) -> np.ndarray:
     """Strips of the first episodes of each subset under each other; (height, width, 3) uint8."""
     strips = [
-        episode_strip(subset, int(episode), columns, scale)
-        for subset in subsets
-        for episode in subset.episodes[:episodes]
+        episode_strip(subset, int(episode), scale=scale) for subset in subsets for episode in subset.episodes[:episodes]
     ]
     width = max(strip.shape[1] for strip in strips)
     strips = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in strips]

@@ -61,7 +61,9 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
     if not tasks and not recipe:
         raise RecipeError("give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes")
     settings, fixed_goals = _settings(given)
-    changes = {name: given[name] for name in _SAME_NAME if name in given} | _sources(given)
+    changes = {name: given[name] for name in _SAME_NAME if name in given}
+    places = {"behaviour": behaviour_source, "backgrounds": background_source}
+    changes |= {name: place_of(given[name]) for name, place_of in places.items() if name in given}
     changes |= {"fixed_goals": fixed_goals} if fixed_goals else {}
     if given.get("sample"):
         changes["deterministic"] = False
@@ -132,16 +134,6 @@ def _settings(given: Mapping[str, Any]) -> tuple[list[str], int | None]:
         *(DistractorSetting.parse(name).name for name in given.get("distractors", ())),
         *dict.fromkeys(goals),
     ], count
-
-
-def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:
-    """Places of files as the recipe has them."""
-    found: dict[str, str | None] = {}
-    if "behaviour" in given:
-        found["behaviour"] = behaviour_source(given["behaviour"])
-    if "backgrounds" in given:
-        found["backgrounds"] = background_source(given["backgrounds"])
-    return found
 
 
 def _renderer(given: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:

@@ -125,7 +125,7 @@ def _seen(root: Path, name: str) -> str | None:
 
 
 def _record_before_files(monkeypatch):
-    def put_shard(store, layer, shard, arrays, *, first_wins=False):
+    def put_shard(store, layer, shard, arrays):
         data = {name: writer.encode(layer, layer.array(name), values) for name, values in arrays}
         files = {name: writer.file_facts(each) for name, each in data.items() if each is not None}
         writer.put_record(store, layer, shard, writer.ShardRecord(key=layer.job_key(shard), files=files))
