@@ -100,7 +100,6 @@ OTHERS = [
     ("paint r --size 2000", "8 to 1024"),
     ("paint r --views nowhere", "unknown view"),
     ("paint r --only cheetah-run", "walker-walk/random/none"),
-    ("paint r --goal hidden", "ant-maze"),
     ("regenerate", "give a RELEASE"),
     ("regenerate r --manifest quickstart", "give a RELEASE"),
     ("regenerate --manifest quickstart", "add --out"),
