@@ -25,7 +25,7 @@ ROLLOUTS = [
     ("walker-walk --level expert,medium", "unknown level 'expert,medium'"),
     (f"{TINY_MAZE} --level randm", "Did you mean 'random'?"),
     ("walker-walk --distracter none", "Did you mean '--distractor'?"),
-    ("walker-walk --distractor static_cue0.5", "has no cue, shake or light"),
+    ("walker-walk --distractor static_cue0.5", "has no cue or light"),
     ("walker-walk --distractor math:Nothing", "cannot find distractor math:Nothing"),
     ("walker-walk --distractor dis:Base", "dis.py has no 'Base'; if that is not your file, rename yours"),
     ("walker-walk --distractor a/mine.py:Base_hard", "is a file; in its folder, give mine:Base_hard"),
