@@ -92,11 +92,8 @@ def _list_settings(as_json, *, task, layout, algo, settings, **_):
 @click.option(
     "--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes to score each pick."
 )
-@click.option(
-    "--seed", type=click.IntRange(0), default=20_000, show_default=True, help="Random seed of the fresh episodes."
-)
 @json_option
-def select_checkpoints(run, episodes, seed, as_json):
+def select_checkpoints(run, episodes, as_json):
     """Pick the expert, medium and mixed checkpoints of a run.
 
     Expert: the first with 95 % of the return at convergence; medium: half of it (mazes: nearest to the paper's row);
@@ -110,7 +107,7 @@ def select_checkpoints(run, episodes, seed, as_json):
     from dmcvb_gen.training.selection import selection_json
 
     with ProgressBar(not as_json, unit=" checkpoints", desc="selection") as bar:
-        picked = select(run, episodes, seed, bar)
+        picked = select(run, episodes, bar)
     if as_json:
         print_json(selection_json(picked))
     else:

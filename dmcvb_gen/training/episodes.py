@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import torch
 
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze.task import SPAWN_NOISE
@@ -86,8 +87,12 @@ def standing_states(task: Task, rng: np.random.Generator, count: int) -> np.ndar
     return rows
 
 
-def useless_setting(task: Task, settings: Any) -> str | None:
-    """Say which setting has no meaning for a task, and the cure; None if all have one."""
+def check_settings_fit(task: Task, settings: Any) -> None:
+    """Refuse a setting that has no meaning for a task.
+
+    Raises:
+      DmcvbError: which one, and the cure.
+    """
     maze, model = is_maze(task.id), task.model
     free = model.njnt > 0 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and not task.model_entries
     fits = {
@@ -98,8 +103,7 @@ def useless_setting(task: Task, settings: Any) -> str | None:
     }
     for name, (fit, what) in fits.items():
         if getattr(settings, name, 0) and not fit:
-            return f"setting {name} is {what}; {task.id} has no use for it, so remove it"
-    return None
+            raise DmcvbError(f"setting {name} is {what}; {task.id} has no use for it, so remove it")
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ from dmcvb_gen.state_file import STATE, pack_state, read_state_file
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.training.episodes import useless_setting
+from dmcvb_gen.training.episodes import check_settings_fit
 from dmcvb_gen.training.networks import as_arrays, as_tensors
 from dmcvb_gen.training.settings import algorithm_module, check_settings
 
@@ -411,8 +411,7 @@ def open_run(folder: str | Path, config: RunConfig, resume: bool) -> Run:
         raise DmcvbError(f"--init-from {source} is neither a run folder nor a policy file")
     digest = found.init_sha256 if found else sha256_file(source) if source and source.is_file() else None
     run = Run(folder, dataclasses.replace(config, init_sha256=digest))
-    if problem := useless_setting(run.task, run.settings):
-        raise DmcvbError(problem)
+    check_settings_fit(run.task, run.settings)
     run.algorithm.check(run)
     with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)

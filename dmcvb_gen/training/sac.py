@@ -216,16 +216,9 @@ class RowBuffer:
         return {"rows": rows, "position": self.position, "full": self.full}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state()`.
-
-        Raises:
-          DmcvbError: it is that of a smaller buffer, as earlier versions made them for short runs.
-        """
-        for name, array in self.arrays.items():
-            rows = state["rows"][name].numpy()
-            if state["full"] and len(rows) < self.size:
-                raise DmcvbError("the run's replay buffer is of an earlier version; go on with that one")
-            array[: len(rows)] = rows
+        """Continue from `state()`."""
+        for name, rows in state["rows"].items():
+            self.arrays[name][: len(rows)] = rows.numpy()
         self.position, self.full = state["position"], state["full"]
 
 

@@ -48,6 +48,8 @@ CANDIDATES = 8
 """Checkpoints near a medium's return that are measured on fresh episodes."""
 MEASURED = 14
 """Checkpoints that are measured, about."""
+SEED = 20_000
+"""Seed of the fresh episodes."""
 BASE_EPISODES = 20
 """Episodes of random actions, which tell where returns start that may be negative."""
 COST_SLACK = 0.3
@@ -275,12 +277,7 @@ def _mixed(curve: Sequence[Point], last: int, check: Callable) -> tuple[Pick, ..
     )
 
 
-def select_checkpoints(
-    folder: str | Path,
-    episodes: int = 100,
-    seed: int = 20_000,
-    progress: ProgressCallback = ignore,
-) -> Selection:
+def select_checkpoints(folder: str | Path, episodes: int = 100, progress: ProgressCallback = ignore) -> Selection:
     """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
 
     Also writes selection.json and curve.png. Works on a running run too; what cannot be picked yet is said
@@ -298,14 +295,14 @@ def select_checkpoints(
     if not curve:
         raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
     task = get_task(read_header(curve[0][2]).task)
-    base = _base(task, episodes, seed)
+    base = _base(task, episodes)
     measured: dict[str, Policy] = {}
 
     def measure(path: Path) -> Evaluation:
         expect(progress, max(len(measured) + 1, MEASURED))
         progress(f"step {int(path.stem):,}")
         policy = measured[str(path)] = load_policy(path, task)
-        return evaluate(policy, task, episodes, seed, streams=FRESH)[0]
+        return evaluate(policy, task, episodes, SEED, streams=FRESH)[0]
 
     end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
     selection = pick_checkpoints(task.id, curve, base, end, measure)
@@ -316,11 +313,11 @@ def select_checkpoints(
     return selection
 
 
-def _base(task: Task, episodes: int, seed: int) -> float:
+def _base(task: Task, episodes: int) -> float:
     """Return at 0 % of the way: that of random actions where returns may be negative, else 0."""
     if task.return_range[0] >= 0:
         return 0.0
-    return evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), seed, streams=FRESH)[0].mean
+    return evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), SEED, streams=FRESH)[0].mean
 
 
 def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies: Mapping[str, Policy]) -> None:

@@ -280,7 +280,7 @@ def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to(monkeypat
 def test_a_loss_that_is_no_longer_finite_stops_the_run():
     data = make_data().states_only()
     data.action[data.train_rows] = float("nan")
-    with pytest.raises(DmcvbError, match="finite"):
+    with pytest.raises(DmcvbError, match="no longer finite at step 1; look at the agent's losses, and at the data"):
         train(state_learner(data), data, SHORT, 12)
 
 

@@ -189,8 +189,8 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
 
 
 def test_the_way_begins_at_random_actions_only_where_returns_may_be_negative():
-    assert selection._base(get_task("walker-walk"), 2, 0) == 0
-    assert selection._base(get_task(TINY_MAZE), 1, 0) < 0
+    assert selection._base(get_task("walker-walk"), 2) == 0
+    assert selection._base(get_task(TINY_MAZE), 1) < 0
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
