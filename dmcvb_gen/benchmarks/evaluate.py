@@ -14,7 +14,6 @@ import contextlib
 import json
 import logging
 import math
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -74,7 +73,6 @@ class Score:
       speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_speed`).
       limit: agent steps after which an episode was cut.
       normalized: the mean, 0 for random actions and 100 for the data's expert; None where one of them is unknown.
-      seconds: time that it took.
       pictures: (frame, size, size, 3) uint8, the first episode at even intervals; None for agents that see states.
     """
 
@@ -85,7 +83,6 @@ class Score:
     speed: float | None = None
     limit: int | None = None
     normalized: float | None = None
-    seconds: float = 0.0
     pictures: np.ndarray | None = field(default=None, repr=False)
 
     @classmethod
@@ -232,7 +229,6 @@ class Evaluator:
         Raises:
           DmcvbError: its actions have another shape than (episode, action), are no numbers, or leave the task's bounds.
         """
-        started = time.perf_counter()
         task, count = self.task, self.episodes
         batch = task.batch(count, self.threads)
         starts = self.streams("initial_state")
@@ -266,7 +262,6 @@ class Evaluator:
             success=None if distance is None else float(ended.mean()),
             speed=None if distance is None else goal_speed(distance, length, ended, task),
             limit=self.steps,
-            seconds=time.perf_counter() - started,
             pictures=np.stack(pictures) if pictures else None,
         )
 
