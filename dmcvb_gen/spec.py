@@ -84,13 +84,10 @@ VISIBLE, HIDDEN, FIXED = GOAL_MODES = tuple(mode.value for mode in GoalMode)
 """The stored names of the goal modes."""
 
 
-REWARDS = ("saturated", "geodesic")
-"""How a maze's reward measures the distance to the goal: DMC-VB's way first, then the shortest path's length."""
-
 SPLITS = ("train", "val")
 """Which videos and maze styles: for data, or kept for evaluation."""
 
-_MAZE_ID = re.compile(rf"{ANT_MAZE}-(?P<layout>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+))?(@(?P<reward>\w+))?")
+_MAZE_ID = re.compile(rf"{ANT_MAZE}-(?P<layout>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+))?")
 
 
 # -- tasks ----------------------------------------------------------------------------------------
@@ -98,21 +95,18 @@ _MAZE_ID = re.compile(rf"{ANT_MAZE}-(?P<layout>[A-Za-z0-9_]+)(:(?P<rows>[*./ ]+)
 
 @dataclass(frozen=True)
 class MazeName:
-    """The parts of a maze's task id, "ant-maze-<layout>[:<rows>][@<reward>]".
+    """The parts of a maze's task id, "ant-maze-<layout>[:<rows>]".
 
     Attributes:
       layout: the layout's name.
       rows: a layout of the user's own, its rows joined by "/"; None for one that the package has.
-      reward: how the distance to the goal is measured, of `REWARDS`; None for DMC-VB's.
     """
 
     layout: str
     rows: str | None = None
-    reward: str | None = None
 
     def __str__(self) -> str:
-        rows = f":{self.rows}" if self.rows else ""
-        return f"{ANT_MAZE}-{self.layout}{rows}" + (f"@{self.reward}" if self.reward else "")
+        return f"{ANT_MAZE}-{self.layout}" + (f":{self.rows}" if self.rows else "")
 
     @classmethod
     def parse(cls, task_id: str) -> MazeName | None:
@@ -128,10 +122,8 @@ def is_maze(task_id: str) -> bool:
 
 def task_folder(task_id: str) -> str:
     """A task id as a folder name: without a maze's rows, if it carries its own."""
-    if not is_maze(task_id):
-        return re.sub(r"[^A-Za-z0-9_.-]", "-", task_id)
-    head, _, reward = task_id.partition("@")
-    return re.sub(r"[^A-Za-z0-9_.-]", "-", head.split(":")[0] + (f"-{reward}" if reward else ""))
+    name = task_id.partition(":")[0] if is_maze(task_id) else task_id
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", name)
 
 
 # -- settings -------------------------------------------------------------------------------------

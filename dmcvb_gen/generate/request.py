@@ -21,7 +21,6 @@ from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own, refuse_file
 from dmcvb_gen.spec import (
     FIXED,
     GOAL_MODES,
-    REWARDS,
     VISIBLE,
     DistractorSetting,
     Level,
@@ -85,20 +84,17 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
 
 
 def task_id_of(given: str | Path) -> str:
-    """A task's id; of a maze in a text file ("ring.txt", "ring.txt@geodesic"), the id that holds its rows.
+    """A task's id; of a maze in a text file ("ring.txt"), the id that holds its rows.
 
     Raises:
       DmcvbError: the file cannot be read, or is no maze.
     """
-    path, at, reward = str(given).partition("@")
-    path = str(Path(path).expanduser()) if path.startswith("~") else path
-    if not (path.endswith(".txt") or Path(path).is_file()):
+    path = Path(given).expanduser()
+    if not (path.suffix == ".txt" or path.is_file()):
         return str(given)
-    if at and reward not in REWARDS:
-        raise UnknownNameError("reward", reward, REWARDS)
     from dmcvb_gen.tasks.ant_maze import layout_task_id
 
-    return layout_task_id(path) + (f"@{reward}" if at and reward != REWARDS[0] else "")
+    return layout_task_id(path)
 
 
 def background_source(given: str | Path) -> str:

@@ -6,7 +6,7 @@ import csv
 import functools
 from importlib import resources
 
-from dmcvb_gen.spec import REWARDS, MazeName
+from dmcvb_gen.spec import MazeName
 
 MAZE_GROUPS = {"empty": "ant-maze/empty", "easy": "ant-maze/single-obstacle", "medium": "ant-maze/multi-obstacle"}
 """Layout's difficulty -> the paper's row, which pools the layouts of a difficulty."""
@@ -27,9 +27,9 @@ def read_table(package: str, name: str, keys: int) -> dict[tuple[str, ...], dict
 
 
 def paper_task(task_id: str) -> str:
-    """The name of a task's row: the paper's mazes, with its reward, are pooled by difficulty."""
+    """The name of a task's row: the paper's mazes are pooled by difficulty."""
     maze = MazeName.parse(task_id)
-    if not maze or maze.rows or maze.reward not in (None, REWARDS[0]):
+    if not maze or maze.rows:
         return task_id
     return next((row for difficulty, row in MAZE_GROUPS.items() if maze.layout.startswith(difficulty)), task_id)
 

@@ -57,7 +57,6 @@ ROLLOUTS = [
     ("hole.txt", "hole"),
     ("no-such.txt", "cannot read layout no-such.txt"),
     ("ring.txt --level expert", "`dmcvb-gen train-behaviour --layout FILE`"),
-    (f"{MAZE}@geodesik", "geodesic"),
     (f"{MAZE} --goal seen", "visible"),
     (f"{MAZE} --goal fixed0x", "unknown goal"),
     (f"{MAZE} --goal fixed0", "unknown goal"),

@@ -322,7 +322,7 @@ def test_what_some_subsets_take_up_is_heard():
     assert asked(maze, goals="fixed")[f"{maze}/expert/fixed"].episodes == 5 * 10
     both = asked(maze, goals=["visible", "fixed2"], episodes=4)
     assert [request.episodes for request in both.values()] == [4, 2 * 2]
-    assert set(asked(f"{maze}@geodesic", split="val")) == {f"{maze}-geodesic/expert/visible"}
+    assert set(asked(maze, split="val")) == {f"{maze}/expert/visible"}
 
 
 def test_shards_that_do_not_fit_in_memory_are_refused_before_any_work(tmp_path, monkeypatch):

@@ -1,13 +1,12 @@
 """Make the tasks of ant mazes from their ids.
 
-"ant-maze-empty7x7" is one of DMC-VB's layouts; "ant-maze-mine:*****/*...*/*****" carries a layout of its own;
-an ending "@geodesic" takes the shortest path's length for the reward.
+"ant-maze-empty7x7" is one of DMC-VB's layouts; "ant-maze-mine:*****/*...*/*****" carries a layout of its own.
 """
 
 from __future__ import annotations
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.spec import REWARDS, MazeName
+from dmcvb_gen.spec import MazeName
 from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, fixed_pairs, get_layout, load_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import AntMaze
 from dmcvb_gen.tasks.base import Task
@@ -19,20 +18,17 @@ def ant_maze_task(task_id: str) -> AntMaze:
     """The task of an id.
 
     Raises:
-      UnknownNameError, LayoutError: no such layout or reward, or a layout that cannot be used.
+      UnknownNameError, LayoutError: no such layout, or a layout that cannot be used.
     """
     name = MazeName.parse(task_id)
     if not name or (not name.rows and name.layout not in LAYOUTS):
         raise UnknownNameError("task", task_id, ANT_MAZE_TASKS)
-    reward = name.reward or REWARDS[0]
-    if reward not in REWARDS:
-        raise UnknownNameError("reward", reward, REWARDS)
     layout = make_layout(name.layout, name.rows) if name.rows else get_layout(name.layout)
-    return AntMaze(layout, reward, task_id)
+    return AntMaze(layout, task_id)
 
 
 def as_maze(task: Task) -> AntMaze:
-    """A task that must be a maze, with its layout and its reward.
+    """A task that must be a maze, with its layout.
 
     Raises:
       DmcvbError: it is none.

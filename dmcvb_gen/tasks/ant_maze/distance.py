@@ -1,6 +1,6 @@
 """Compute fields of shortest-path distance to the goal of a maze (scikit-fmm).
 
-Two measures. "saturated" is DMC-VB's: travel times of a wave from the whole goal cell, on a grid of 10
+Two measures. "saturated" is DMC-VB's, the reward's: travel times of a wave from the whole goal cell, on a grid of 10
 pixels a cell, as fast as another wave's travel time from the walls, up to 5 pixels (the "saturated fast marching
 square"), looked up at the ant's pixel. "geodesic" is the shortest path itself: unit speed, from the goal's
 exact position, interpolated between pixels.
@@ -84,22 +84,8 @@ def geodesic_field(layout: Layout, goal: np.ndarray) -> DistanceField:
     return _finish(np.ma.where(away <= start, away, times + start), layout)
 
 
-def make_field(reward: str, layout: Layout, goal: np.ndarray) -> DistanceField:
-    """The field of a measure, one of `spec.REWARDS`, for a goal position (x, y), meters.
-
-    Raises:
-      LayoutError: the goal is in a wall.
-    """
-    row, column = np.rint(layout.grid(np.asarray(goal)[:2])).astype(int).tolist()
-    cell = row, column
-    if reward == "saturated":
-        return saturated_field(layout, cell)
-    layout.check_cell(cell, "goal")
-    return geodesic_field(layout, goal)
-
-
-def look_up(reward: str, layout: Layout, fields: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Distances of many episodes at once, each from its own field.
+def look_up(layout: Layout, fields: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """DMC-VB's distances of many episodes at once, each from its own saturated field.
 
     Args:
       fields: (n, row, column) values.
@@ -109,13 +95,16 @@ def look_up(reward: str, layout: Layout, fields: np.ndarray, positions: np.ndarr
       (n,) float64, finite.
     """
     height, width = fields.shape[1:]
-    pixel = (layout.grid(positions) + 0.5) * PIXELS  # pixel i covers [i, i + 1)
+    index = np.rint((layout.grid(positions) + 0.5) * PIXELS - 1).astype(int)  # pixel i covers [i, i + 1)
+    row, column = np.clip(index[:, 0], 0, height - 1), np.clip(index[:, 1], 0, width - 1)
+    return fields[np.arange(len(fields)), row, column]
+
+
+def blend(layout: Layout, fields: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Do as `look_up`, blended between the pixels of geodesic fields."""
+    height, width = fields.shape[1:]
     each = np.arange(len(fields))
-    if reward == "saturated":
-        index = np.rint(pixel - 1).astype(int)
-        row, column = np.clip(index[:, 0], 0, height - 1), np.clip(index[:, 1], 0, width - 1)
-        return fields[each, row, column]
-    low = np.clip(pixel - 0.5, 0, [height - 1.0, width - 1.0])
+    low = np.clip((layout.grid(positions) + 0.5) * PIXELS - 0.5, 0, [height - 1.0, width - 1.0])
     corner = np.minimum(low.astype(int), [height - 2, width - 2])
     weight = low - corner
     row, column = corner.T

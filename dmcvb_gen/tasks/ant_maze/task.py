@@ -24,7 +24,7 @@ from dmcvb_gen.tasks.ant_maze.arena import (
     look_numbers,
     textured_model,
 )
-from dmcvb_gen.tasks.ant_maze.distance import PIXELS, geodesic_field, look_up, make_field
+from dmcvb_gen.tasks.ant_maze.distance import PIXELS, blend, geodesic_field, look_up, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import Layout
 from dmcvb_gen.tasks.base import ACTION_REPEAT, Generators, PhysicsBatch, Places, Task
 
@@ -160,10 +160,12 @@ class AntMazeBatch(PhysicsBatch):
         self.sims.forward(ids=ids)
         self._touched[ids] = False
         for sim in ids:
-            field = make_field(self.task.reward, self.task.layout, self._mocap[sim, 0])
+            goal = self._mocap[sim, 0]
+            row, column = np.rint(self.task.layout.grid(goal[:2])).astype(int).tolist()
+            field = saturated_field(self.task.layout, (row, column))
             self._fields[sim], self._largest[sim] = field.values, field.largest
             if self._paths is not None:
-                self._paths[sim] = geodesic_field(self.task.layout, self._mocap[sim, 0]).values
+                self._paths[sim] = geodesic_field(self.task.layout, goal).values
         self._touched[ids] = self._gaps(ids) < 0
 
     # -- stepping -----------------------------------------------------------------------------
@@ -224,7 +226,7 @@ class AntMazeBatch(PhysicsBatch):
 
     def distance(self) -> np.ndarray:
         """(size,): meters to the goal as the reward measures them."""
-        return look_up(self.task.reward, self.task.layout, self._fields, self._xpos[:, self._torso, :2])
+        return look_up(self.task.layout, self._fields, self._xpos[:, self._torso, :2])
 
     def track_paths(self) -> None:
         """Keep fields of the shortest path for `path_length`, from the next reset on."""
@@ -234,7 +236,7 @@ class AntMazeBatch(PhysicsBatch):
         """(size,): length of the shortest path to the goal's center, meters; 0 once it is touched."""
         position = self._xpos[:, self._torso, :2]
         assert self._paths is not None  # `track_paths` came first
-        return np.where(self._touched, 0.0, look_up("geodesic", self.task.layout, self._paths, position))
+        return np.where(self._touched, 0.0, blend(self.task.layout, self._paths, position))
 
     def state(self):
         position, goal = self._xpos[:, self._torso], self.goal()
@@ -288,7 +290,6 @@ class AntMaze(Task):
 
     Args:
       layout: the maze.
-      reward: measure of distance, "saturated" (DMC-VB's) or "geodesic" (the shortest path).
       id: the task's name.
     """
 
@@ -304,8 +305,8 @@ class AntMaze(Task):
     unstored_fields = ("sensors_accelerometer", "sensors_touch", "target_activated")
     """Fields of a state that depend on the step before it, so that a physics state alone does not give them."""
 
-    def __init__(self, layout: Layout, reward: str, id: str):
-        self.layout, self.reward, self.id = layout, reward, id
+    def __init__(self, layout: Layout, id: str):
+        self.layout, self.id = layout, id
 
     @property
     def model(self):
