@@ -114,6 +114,7 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
     assert "b1: not in the release: walker-walk/expert/none" in result.output
     page, facts = (out / "report.html").read_text(), json.loads((out / "report.json").read_text())
     assert page.index("All checks passed") < page.index("Structure") < page.index("Episode returns")
+    assert "Incomplete" not in page
     assert "paper 913" not in page and "claims no score" in page
     assert page.count(" [smoke]</b>") == 3
     assert page.count("data:image/png;base64") >= 5 and "src='http" not in page and "href=" not in page

@@ -49,5 +49,7 @@ def test_help_fits_80_columns_and_has_an_example(command):
     assert not [line for line in lines if len(line) > 80]
     if not command:
         assert all(f"  {name} " in "\n".join(lines) for name in COMMANDS)
+    if command == ["rollout"]:
+        assert "  --recipe FILE|NAME " in "\n".join(lines)
     if len(command) == 1 and command != ["list"]:
         assert any(line.strip().startswith(f"dmcvb-gen {command[0]}") for line in lines)

@@ -76,6 +76,10 @@ def test_dynamic_stays_in_its_ranges(task_id, difficulty, scale):
     assert speed.max() <= 2 * 0.4 * scale * r0 / 4 + slack  # two ticks a frame
 
 
+def test_the_seam_of_azimuths_is_at_minus_pi():
+    np.testing.assert_allclose(spherical(np.array([-2.0, 0, 0])), [2, np.pi / 2, -np.pi])
+
+
 @pytest.mark.parametrize("difficulty", ["easy", "hard", "0.02"])
 @pytest.mark.parametrize("task_id", ["quadruped-walk", "fish-upright", "acrobot-swingup", "manipulator-bring_ball"])
 def test_the_range_is_around_every_nominal_camera(task_id, difficulty):

@@ -117,6 +117,7 @@ def test_a_release_of_them_goes_the_whole_way(task_id, tmp_path):
     assert "same digest" in run("regenerate", folder, "--check")
     [lit] = [subset for subset in subsets.values() if "light" in subset.setting]
     assert lit.read("exogenous/light_shift").shape == (2, 7, 3) and lit.labels().light_shift.any()
+    np.testing.assert_array_equal(lit.labels().material_rgb, lit.read("exogenous/material_rgb"))
     run("card", folder)
     assert all(sentence in (folder / "README.md").read_text() for sentence in SENTENCES.values())
     plain = ["repaint", folder, "--only", f"{task_id}/random/static_0.35", "--out", tmp_path / "again", "--distractor"]

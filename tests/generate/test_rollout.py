@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -170,6 +171,12 @@ def test_counts_are_those_of_the_release_that_is_made(small_release, tmp_path):
     after = count(make_plan(small_recipe(), small_release))
     assert [(subset.done, subset.left, subset.frames, subset.raw_bytes) for subset in after] == [(3, 0, 0, 0)] * 3
     assert not (tmp_path / "r").exists()
+
+
+def test_a_file_goes_before_a_shipped_recipe_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "laom").write_text((files("dmcvb_gen.generate") / "data/recipes/dmcvb-mini.yaml").read_text())
+    assert load_recipe("laom") == load_recipe("dmcvb-mini") != load_recipe("quickstart")
 
 
 def test_shipped_recipes_expand_to_what_the_paper_has():

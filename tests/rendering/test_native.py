@@ -14,10 +14,11 @@ from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.rendering.native import textures
 from dmcvb_gen.rendering.native.textures import background_texels, levels, packed
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from tests.conftest import python
-from tests.rendering.test_rendering import frames_of, near, needs_opengl, renderer_of
+from tests.rendering.test_rendering import FRAMES, frames_of, near, needs_opengl, renderer_of
 from tests.tasks.test_tasks import SUITE
 
 MAZE = "ant-maze-medium7x7a"
@@ -110,6 +111,20 @@ def test_what_does_not_move_is_kept_only_as_long_as_it_looks_the_same():
     renderer = renderer_of("native", task, setting)
     alone = np.concatenate([renderer.render(physics[i : i + 1], labels[i : i + 1]) for i in order])
     np.testing.assert_array_equal(renderer.render(physics[order], labels[order]), alone)
+
+
+def test_more_backgrounds_than_there_is_room_for_are_drawn_one_after_the_other(monkeypatch):
+    task, setting, physics, labels = frames_of("walker-walk", "dynamic")
+    labels.background_frame[:] = np.arange(FRAMES)
+    all_fit = renderer_of("native", task, setting, 16).render(physics, labels)
+    monkeypatch.setattr(textures, "SKY_BYTES", 0)  # room for eight, the least there is
+    np.testing.assert_array_equal(renderer_of("native", task, setting, 16).render(physics, labels), all_fit)
+
+
+def test_a_picture_of_one_grey_is_that_grey_at_every_distance():
+    for grey in range(256):
+        nearest, *farther = levels(np.full((8, 8, 3), grey, np.uint8), srgb=True)
+        assert all((level == nearest[0, 0]).all() for level in farther)
 
 
 @pytest.mark.parametrize("shape", [(256, 256), (240, 426), (800, 799), (2, 3)])

@@ -101,6 +101,14 @@ class RendererTests:
             assert (shown[label][~goal] == hidden[label][~goal]).mean() > 0.999
         assert (hidden["depth"][goal] > shown["depth"][goal] - 1e-3).mean() > 0.9  # what lies behind it
 
+    def test_frames_of_another_task_are_refused(self):
+        task, setting, physics, labels = frames_of("walker-walk", "none")
+        renderer = renderer_of(self.name, task, setting, 16)
+        for wrong in (physics[0], physics[:, 1:], physics[1:]):
+            with pytest.raises(ValueError, match="are not frames of walker-walk"):
+                renderer.render(wrong, labels)
+        renderer.close()
+
 
 class TestNative(RendererTests):
     name = "native"
