@@ -106,7 +106,7 @@ class OpenglRenderer(Renderer):
         self._own_values = {name: getattr(self._model, name).copy() for name in _REPLACED}
         self._data = mujoco.MjData(self._model)
         self._painter = _painter(self._model, size)
-        self._terrain_changes = "hfield_data" in task.model_entries
+        self._terrain_changes = task.draws_terrain or "hfield_data" in task.model_entries
         self._shown: tuple[int, int] = (-1, -1)
 
     def render(self, physics, exogenous, views=None, hide_goal=False):

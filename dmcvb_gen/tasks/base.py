@@ -137,6 +137,8 @@ class Task(abc.ABC):
     """Opacity of the ground plane under distractors (Distracting Control Suite)."""
     model_entries: Mapping[str, np.ndarray] = {}
     """Model field -> flat indices of the entries that an episode sets; `physics` rows end with their values."""
+    draws_terrain: bool = False
+    """True if each episode draws height fields too large for a row of `physics`."""
 
     @property
     def picture_model(self) -> mujoco.MjModel:

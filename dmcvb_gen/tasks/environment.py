@@ -34,6 +34,8 @@ LARGEST = float(np.finfo(np.float32).max)
 """Of what observations, rewards and discounts are stored as."""
 MAX_ENTRIES = 10_000
 """Values of a model's field that may change in an episode, at most: each row of `physics` holds them."""
+TERRAIN, TERRAIN_KEY = "hfield_data", 3
+"""The field that may have more if the start of an episode draws it, and how many numbers of a row stand for it."""
 ASSETS = ("mesh_", "oct_", "skin_", "tex_")
 """Beginnings of the names of large fields of a model, which only the start's check compares."""
 BAD_STATES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
@@ -63,6 +65,7 @@ class EnvironmentTask(Task):
 
     def __init__(self, id: str, make: Callable[[], Any], domain: str = ""):
         self.id, self._make, self._idle = id, make, list[Any]()
+        self._terrain = functools.lru_cache(maxsize=64)(self._draw_terrain)  # images come in the order of their videos
         self.floor_alpha = {"walker": 1.0, "cheetah": 1.0, "reacher": 0.0}.get(domain, 0.3)
         self.trusted = self.reusable = bool(domain)  # the tests compare the suite's tasks with dm_control
         self.state_fields, self.model_entries = {}, {}
@@ -104,8 +107,36 @@ class EnvironmentTask(Task):
         for name, columns in self.model_entries.items():
             fields[f"model.{name}"] = [place, place + len(columns)]
             place += len(columns)
+        if self.draws_terrain:
+            fields[f"seed and CRC-32 of model.{TERRAIN}"] = [place, place + TERRAIN_KEY]
         bounds = {"low": self.action_low.tolist(), "high": self.action_high.tolist()}
         return {"action": bounds, "physics": {"fields": fields, "mjtState": self.physics_spec}}
+
+    @property
+    def physics_size(self) -> int:
+        return super().physics_size + TERRAIN_KEY * self.draws_terrain
+
+    def terrain_of(self, row: np.ndarray) -> tuple[int, ...]:
+        """High and low half of the seed that draws a row's terrain, CRC-32 of its heights; empty if none is drawn."""
+        return tuple(row[len(row) - TERRAIN_KEY * self.draws_terrain :].astype(int).tolist())
+
+    def apply_entries(self, model: mujoco.MjModel, row: np.ndarray) -> None:
+        """See `Task`; terrain is drawn again from the row's seed.
+
+        Raises:
+          DmcvbError: it is not the stored one.
+        """
+        super().apply_entries(model, row)
+        if key := self.terrain_of(row):
+            model.hfield_data[:] = self._terrain(key)
+
+    def _draw_terrain(self, key: tuple[int, ...]) -> np.ndarray:
+        episode = _Episode(self, self.take_environment(seed := key[0] << 32 | key[1]))
+        episode.reset(seed)
+        self.give_back([episode.environment])
+        if episode.terrain != key:
+            raise self.error("draws other terrain than is stored; install dm_control, numpy and scipy as they were")
+        return episode.model.hfield_data.copy()
 
     def at(self, action_repeat: int) -> Task:
         other = super().at(action_repeat)
@@ -158,6 +189,9 @@ class EnvironmentTask(Task):
         start, assets = probes[0].models[0], probes[0].assets
         changed = {name for probe in probes for name in probe.changed(start)}
         self._fixed = {name: value for name, value in start.items() if not self.trusted and name not in changed}
+        self.draws_terrain = TERRAIN in changed and start[TERRAIN].size > MAX_ENTRIES
+        if self.draws_terrain and not any(TERRAIN in probe.changed(probe.models[0]) for probe in probes):
+            changed.remove(TERRAIN)
         self.model_entries = {name: np.arange(start[name].size) for name in sorted(changed)}
         repainted = {name for probe in probes for name in assets if probe.assets.get(name) != assets[name]}
         large = {name for name in changed if start[name].size > MAX_ENTRIES}
@@ -320,7 +354,7 @@ class _Episode:
     def __init__(self, task: EnvironmentTask, environment: Any, place: int = 0):
         self.task, self.environment, self.place = task, environment, place
         self.steps, self.terminated, self.truncated = 0, False, False
-        self.state = np.zeros(0)
+        self.state, self.terrain = np.zeros(0), tuple[int, ...]()
         self._checked: tuple[Any, list[tuple[Callable[[], Any], Any]]] = None, []
 
     @property
@@ -332,6 +366,7 @@ class _Episode:
         with self._told(), seeded(seed):
             seed_task(self.environment.task, seed)
             self._observe(self.environment.reset().observation)
+        self.terrain = seed >> 32, seed & 0xFFFFFFFF, zlib.crc32(self.model.hfield_data)
         self._warned = self._warnings()
         self.check_model()
 
@@ -372,13 +407,14 @@ class _Episode:
         """(physics,) float64: the simulation's state, then the model's entries."""
         owners = (field_owner(self.model, name) for name in self.task.model_entries)
         entries = [np.ravel(getattr(owner, name)) for owner, name in owners]
-        return np.concatenate([self.full_state(), *entries])
+        return np.concatenate([self.full_state(), *entries, self.terrain if self.task.draws_terrain else ()])
 
     def put(self, row: np.ndarray) -> None:
         """Put the simulation into a stored row; what the task keeps in Python stays as it is."""
         physics, spec = self.environment.physics, self.task.physics_spec
         with self._told():
             self.task.apply_entries(self.model, row)
+            self.terrain = self.task.terrain_of(row)
             physics.reset()
             physics.set_state(row[: mujoco.mj_stateSize(self.task.model, spec)], spec)
             physics.after_reset()
@@ -389,6 +425,8 @@ class _Episode:
 
     def check_model(self) -> None:
         """Raise EpisodeError if the episode changed the model where the episodes of the start's check did not."""
+        if self.task.draws_terrain and zlib.crc32(self.model.hfield_data) != self.terrain[-1]:
+            raise self.error(f"it changed {TERRAIN} of the model in a step; change it at the start of an episode alone")
         model, (checked, values) = self.model, self._checked
         if model is checked and all(read() == value for read, value in values):
             return

@@ -47,7 +47,7 @@ def suite_task(task_id: str) -> EnvironmentTask:
 
     def make() -> Any:
         environment = copy.deepcopy(first())  # which costs a fifth of making it
-        # Quadruped-escape would put its terrain on a graphics card before it is refused.
+        # Quadruped-escape puts its terrain on a graphics card if there is one; our renderers do so by themselves.
         environment.physics._make_rendering_contexts = lambda: None
         # The observation between the two control steps of an agent step is not asked for: it takes half of the time.
         task = environment.task

@@ -24,8 +24,8 @@ from tests.tasks.test_tasks import SUITE
 MAZE = "ant-maze-medium7x7a"
 GOLDEN = Path(__file__).parents[1] / "golden"
 CASES = [(task, setting) for task in LOCOMOTION_TASKS for setting in ("none", "dynamic")] + [(MAZE, "none")]
-PAINTED = [task for task in SUITE if task not in (*LOCOMOTION_TASKS, "dog-walk", "lqr-lqr_2_1")]
-"""Tasks of dm_control's suite that this painter paints: no mesh with a skin, no transparent body."""
+PAINTED = [task for task in SUITE if task not in (*LOCOMOTION_TASKS, "dog-walk", "lqr-lqr_2_1", "quadruped-escape")]
+"""Tasks of dm_control's suite that this painter paints: no mesh with a skin, no transparent body, no height field."""
 LARGEST_DIFFERENCE = {MAZE: 2.5} | dict.fromkeys(SUITE, 1.5)
 """Mean absolute difference to OpenGL, grey levels of 255 (OpenGL's own picture of 512 pixels, averaged, is 2.1 off)."""
 

@@ -147,6 +147,18 @@ def muscles():
     return arm(xml=ARM.replace('<motor name="first" joint="hinge" ctrlrange="-1 1"/>', act))
 
 
+class Hills(Arm):
+    def start(self, physics):
+        physics.model.hfield_data[:] = self.random.uniform(0, 1, 120 * 120)
+
+
+def hills(task=Hills):
+    """Terrain of more numbers than a stored row has."""
+    asset = '<hfield name="hills" nrow="120" ncol="120" size="2 2 .5 .1"/></asset>'
+    ground = '<geom type="hfield" hfield="hills" pos="0 0 -.4"/></worldbody>'
+    return arm(task(), xml=ARM.replace("</asset>", asset).replace("</worldbody>", ground))
+
+
 class CountsEpisodes(Arm):
     episodes = 0
 
@@ -258,18 +270,6 @@ def other_models():
     return arm(xml=ARM.replace('<light pos="0 0 3"/>', '<light pos="0 0 3"/>' * np.random.randint(1, 100)))
 
 
-class Hills(Arm):
-    def start(self, physics):
-        physics.model.hfield_data[:] = self.random.uniform(0, 1, 120 * 120)
-
-
-def hills():
-    """Terrain of more numbers than a stored row has."""
-    asset = '<hfield name="hills" nrow="120" ncol="120" size="2 2 .5 .1"/></asset>'
-    ground = '<geom type="hfield" hfield="hills" pos="0 0 -.4"/></worldbody>'
-    return arm(Hills(), xml=ARM.replace("</asset>", asset).replace("</worldbody>", ground))
-
-
 class PaintedAnew(Arm):
     def start(self, physics):
         physics.model.tex_data[:] = self.random.randint(256)
@@ -281,3 +281,16 @@ def restarts_itself():
             return super().step(action) if self.physics.time() < 0.1 else self.reset()
 
     return arm(kind=Environment)
+
+
+def quake(after=0.45):
+    class Quake(Hills):
+        def after_step(self, physics):
+            if physics.time() > after:
+                physics.model.hfield_data[0] = physics.time()
+
+    return hills(Quake)
+
+
+def early_quake():
+    return quake(0.0)

@@ -42,7 +42,7 @@ FULL = mujoco.mjtState.mjSTATE_INTEGRATION
 
 EQUAL = (
     h.plain, h.WritesIntoTheSimulation, h.DrawsItsModel, h.own_step_and_reset, h.EndedByPython, HALF_A_DISCOUNT,
-    h.ThreeActionsForTwoMotors, h.odd_bounds, h.flat_torques, h.odd_limit, h.sleeping, h.muscles,
+    h.ThreeActionsForTwoMotors, h.odd_bounds, h.flat_torques, h.odd_limit, h.sleeping, h.hills, h.muscles,
     h.CountsEpisodes, h.keeps_physics,
 )  # fmt: skip
 SEEDED = (h.DrawsElsewhereAtTheStart, h.GeneratorOfItsOwn, h.drawn_model)
@@ -58,7 +58,7 @@ REFUSED = {
     observed(lambda physics: {"t": np.array([time.perf_counter()])}): "gives another episode for the same seed",
     observed(lambda physics: {"name": "arm"}): "observes 'name' as <U3; give numbers",
     observed(lambda physics: {"arm": {"position": physics.data.qpos}}): "observes 'arm' as object; give numbers",
-    h.hills: "changes hfield_data of the model in its episodes, which cannot be stored",
+    h.early_quake: "changes hfield_data of the model in its episodes, which cannot be stored",
     observed(lambda physics: 1.0): "observes a float; get_observation must give a",
     observed(lambda physics: {}): "observes nothing; get_observation must give a dictionary",
     observed(lambda physics: dict.fromkeys("xy"[: 1 + (physics.time() > 0.1)], 0)): "'y' in different sizes .0 and 1.",
@@ -82,6 +82,7 @@ REFUSED = {
     rewarded(lambda physics: {}["left"] if late(physics) else 0.0): LATE + "failed .KeyError: 'left'",
     h.diverges: LATE + "the simulation diverged .mjWARN_BAD",
     h.diverges_quietly: LATE + "the simulation diverged .mjWARN_BAD",
+    h.quake: LATE + "changed hfield_data of the model in a step",
     h.LateChange: LATE + "changed geom_rgba of the model, which its first episodes left as it was",
 }  # fmt: skip
 
@@ -161,7 +162,7 @@ def test_what_dm_control_does_is_what_is_stored(case):
     assert (together.state[0, 0] != together.state[1, 0]).any() or case in (h.flat_torques, h.own_step_and_reset)
 
 
-@named([h.plain, h.DrawsItsModel, h.EndedByPython, h.CountsEpisodes, h.keeps_physics, *SEEDED])
+@named([h.plain, h.DrawsItsModel, h.EndedByPython, h.CountsEpisodes, h.hills, h.keeps_physics, *SEEDED])
 def test_an_episode_depends_on_its_index_alone_and_can_be_replayed(case):
     task, other = task_of(case), task_of(case)
     task.most_at_once = 3
@@ -193,3 +194,12 @@ def test_a_task_for_a_batch_is_refused_if_float32_does_not_hold_what_it_gives(mo
 def test_an_environment_is_used_again_only_if_nothing_of_an_episode_is_left_in_it():
     for case, expected in ((h.WritesIntoTheSimulation, True), (h.DrawsItsModel, False), (h.CountsEpisodes, False)):
         assert task_of(case).reusable is expected
+
+
+def test_terrain_that_is_drawn_otherwise_than_it_was_stored_is_refused():
+    task = task_of(h.hills)
+    row = rolled(task, [0]).physics[0, 0]
+    task.apply_entries(copy.deepcopy(task.model), row)
+    row[-1] += 1
+    with pytest.raises(DmcvbError, match="draws other terrain than is stored; install dm_control, numpy and scipy"):
+        task.apply_entries(copy.deepcopy(task.model), row)
