@@ -131,15 +131,15 @@ if __name__ == "__main__":
 """
 
 
-def test_workers_end_when_their_parent_was_killed(tmp_path):
-    (tmp_path / "parent.py").write_text(PARENT)
-    pids = tmp_path / "pids"
-    pids.mkdir()
-    parent = subprocess.Popen([sys.executable, str(tmp_path / "parent.py"), str(pids)])
-    assert wait(lambda: len(list(pids.iterdir())) == 2)
-    parent.kill()
-    parent.wait()
-    assert wait(lambda: ended(path.name for path in pids.iterdir()))
+@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_their_parent(stop, tmp_path, tmp_path_factory):
+    script = tmp_path_factory.mktemp("script") / "parent.py"
+    script.write_text(PARENT)
+    parent = subprocess.Popen([sys.executable, str(script), str(tmp_path)])
+    assert wait(lambda: len(list(tmp_path.iterdir())) == 2)
+    parent.send_signal(stop)
+    parent.wait(timeout=60)  # the workers would sleep for two minutes
+    assert wait(lambda: ended(path.name for path in tmp_path.iterdir()))
 
 
 GUARDLESS = """

@@ -67,7 +67,7 @@ def test_headed_is_what_an_ant_in_the_middle_of_an_open_maze_sees():
 
 
 def test_the_actor_and_the_network_that_learns_agree(tmp_path):
-    run = open_run(tmp_path / "run", config(), False)
+    run = open_run(tmp_path / "run", config(settings={"simulations": 6}), False)
     base = base_policy(run)
     student = Student(run, base)
     policy = Policy(run.header, as_arrays(student.weights()), "")
@@ -78,6 +78,7 @@ def test_the_actor_and_the_network_that_learns_agree(tmp_path):
     plain = Policy(base.header, base.weights, "")
     wanted = plain.act(open_maze_observation(seen, policy.predict_waypoint(seen)), deterministic=True)
     np.testing.assert_array_equal(policy.act(seen, deterministic=True), wanted)
+    assert (student.act(seen) == wanted).all(axis=1).tolist() == [True] * 3 + [False] * 3, "half act by their mean"
 
 
 def test_places_are_drawn_on_the_floor():
