@@ -30,7 +30,6 @@ def commands(task, folder):
     yield "verify", f"file:{folder / 'published'}"
     yield "fetch", f"file:{folder / 'published'}", "--out", folder / "fetched"
     yield "export", release, "--to", "npz", "--out", folder / "exported"
-    yield "publish", folder / "exported", f"file:{folder / 'published-export'}"
 
 
 @pytest.mark.slow_cases("ant-maze-empty7x7", "walker-walk")
