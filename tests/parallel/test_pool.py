@@ -119,7 +119,7 @@ def test_workers_have_the_threads_that_they_were_given_and_end_with_the_pool():
 
 
 PARENT = """
-import os, sys, time
+import os, signal, sys, time
 from dmcvb_gen.parallel import in_order
 
 def announce(number, tick):
@@ -127,6 +127,7 @@ def announce(number, tick):
     time.sleep(120)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a script runs in the background
     in_order(announce, [1, 2], 2)
 """
 
