@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
 import gc
@@ -11,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linux-gnu/libEGL.so.1") else "disable")
 
@@ -41,13 +41,13 @@ textures._packed_levels = functools.lru_cache(maxsize=64)(textures._packed_level
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown():
     """Give memory back from 3 GB on: one process of tests meets more tasks than a command ever does."""
-    if not os.path.exists("/proc/self/statm") or int(open("/proc/self/statm").read().split()[1]) < 750_000:  # pages
+    statm = Path("/proc/self/statm")  # of Linux alone, as is malloc_trim
+    if not statm.exists() or int(statm.read_text().split()[1]) < 750_000:  # pages
         return
     for cache in (get_task, default_renderer, textured_model, textures._packed_levels):
         cache.cache_clear()
     gc.collect()
-    with contextlib.suppress(OSError, AttributeError):  # glibc alone has it
-        ctypes.CDLL(None).malloc_trim(0)
+    ctypes.CDLL(None).malloc_trim(0)
 
 
 WALKERS = {"tasks": "walker-walk", "levels": "random", "settings": ["none", "static", "dynamic"]}

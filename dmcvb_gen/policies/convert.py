@@ -139,8 +139,8 @@ def convert(
     distribution = layout.distribution or distribution
     if activation is None or distribution is None:
         raise PolicyFileError(
-            f"{path} does not say its activation and its actions; run `{command} --activation tanh --actions tanh`, "
-            "or as they are, and give its file"
+            f"{path} does not say its activation and its actions; run `{command} --activation tanh --actions tanh` "
+            "with the ones that it has, and use the new file"
         )
     weights = _weights(path, task, state, body, mean, layout.log_std, distribution)
     if distribution == "gaussian" and len(weights["mean.bias"]) == task.action_size:
@@ -159,7 +159,7 @@ def convert(
     if wrapper and statistics is None:
         raise PolicyFileError(
             f"{path} was trained behind {wrapper}, whose numbers are not in it; run `{command} --statistics FILE` with "
-            "its mean and std of observations (0 and 1 if it normalized none), and give its file"
+            "its mean and std of observations (0 and 1 if it normalized none), and use the new file"
         )
     weights |= _normalization(statistics, task.behaviour_size)
     normalizes = bool(weights["observation_mean"].any() or (weights["observation_std"] != 1).any())

@@ -65,6 +65,7 @@ class Renderer(abc.ABC):
         """The frames as `render` paints them, and the same with `hide_goal`."""
         return self.render(physics, exogenous, views), self.render(physics, exogenous, views, hide_goal=True)
 
+    @abc.abstractmethod
     def render_labels(
         self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False
     ) -> dict[str, np.ndarray]:
@@ -74,7 +75,6 @@ class Renderer(abc.ABC):
           "depth" -> (frame, view, size, size) float32 in meters (0: sky); "segmentation" -> the same shape, int16
           ids of geoms (-1: sky).
         """
-        raise NotImplementedError
 
     def describe(self) -> dict[str, Any]:
         """Name and every setting that decides a pixel, for the manifest."""

@@ -147,9 +147,7 @@ def test_a_smaller_label_budget_is_a_part_of_a_larger_one_and_hangs_on_the_seed(
             drawn[seed, budget] = set(episodes.tolist())
             assert len(drawn[seed, budget]) == budget and not held_out.any()
         everything, held_out = choose_episodes(subset, Slice(subset.name), seed)
-        assert held_out.sum() == 10 and not drawn[seed, 128] & set(
-            everything[held_out]
-        )  # their images are learned from
+        assert held_out.sum() == 10 and drawn[seed, 128].isdisjoint(everything[held_out])  # whose images are learned
         assert drawn[seed, 2] < drawn[seed, 8] < drawn[seed, 32] < drawn[seed, 128]
     assert drawn[0, 8] != drawn[1, 8]
 
