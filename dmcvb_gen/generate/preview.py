@@ -142,14 +142,11 @@ def write_preview(
         raise StoreError(f"{release} has no finished episodes with images; {cure}")
     folder = local_path(out) if out else opened.path / "preview"
     few = episodes or max(1, min(4, SHEET_EPISODES // len(subsets)))
-    picture = Image.fromarray(contact_sheet(subsets, few))
-    sheet = io.BytesIO()
-    picture.save(sheet, "PNG")
-    files = {"contact_sheet.png": sheet.getvalue(), "preview.webp": video_bytes(video_frames(subsets))}
-    store = open_store(folder)  # which writes through no link
-    for name, data in files.items():
-        store.replace(name, data)
-    return [folder / name for name in files]
+    store, sheet = open_store(folder), io.BytesIO()  # a store writes through no link
+    Image.fromarray(contact_sheet(subsets, few)).save(sheet, "PNG")
+    store.replace("contact_sheet.png", sheet.getvalue())
+    store.replace("preview.webp", video_bytes(video_frames(subsets)))
+    return [folder / "contact_sheet.png", folder / "preview.webp"]
 
 
 def video_bytes(frames: np.ndarray) -> bytes:

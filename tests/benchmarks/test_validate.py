@@ -579,6 +579,7 @@ def test_the_cells_of_a_goal_pair_are_those_of_the_rollout(small_mazes):
 # -- B1 and B3 ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_maze_release_goes_through_b1_and_b3(small_mazes, tmp_path):
     command = ["validate", small_mazes, "--benchmark", "b1", "--benchmark", "b3", "--agents", "state-bc,bc,id+bc"]
     out = tmp_path / "out"

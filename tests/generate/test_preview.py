@@ -28,6 +28,7 @@ def test_the_video_has_some_512_pixels_a_side_and_shows_the_stored_frames(releas
     assert (place[0] != place[1]).any() and place.min() < 60 and earned.min() < 60  # the step, the return so far
 
 
+@pytest.mark.slow
 def test_a_sheet_of_many_subsets_fits_on_a_screen(small_release, tmp_path):
     sheet, _ = write_preview(small_release, out=tmp_path)
     assert len(Release.open(small_release).subsets) == 3 and Image.open(sheet).height == 6 * (LABEL_HEIGHT + 32)
