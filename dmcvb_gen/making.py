@@ -6,6 +6,7 @@ docstring (`dmcvb_gen.cli.options` says how). A call that was interrupted resume
 
 import hashlib
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from annotated_types import Gt, Lt
@@ -163,6 +164,8 @@ def make(
             raise DmcvbError(f"{min(options)} has no effect: with a release, nothing is made; remove it")
         opened = open_for_reading(str(release))
     else:
+        if taken := options.keys() & {"tasks", "levels", "distractors", "goals", "out"}:
+            raise DmcvbError(f"make() decides {min(taken)} by the name {name!r}; remove it, or call rollout()")
         levels = level.split("-")
         setting = [SubsetSpec.parse(task, one, setting).setting for one in levels][0]
         name, episodes = subset_name(task, level, setting), episodes or EPISODES
@@ -171,6 +174,8 @@ def make(
     train, val = [], []
     for part in opened.parts_of(name) or [name]:
         subset = opened[part]
+        if len(subset) < (episodes or 0):
+            raise DmcvbError(f"{part} of {opened.place} has {len(subset)} of {episodes} episodes; give fewer")
         order = np.random.default_rng(seed).permutation(subset.episodes[:episodes])
         if len(order) < 2:
             raise DmcvbError(f"{part} has {len(order)} episodes; give 2 or more, for train and val")
@@ -185,7 +190,11 @@ def _cached(task: str, levels: tuple[str, ...], episodes: int | None, options: d
     """Roll a task out in the user's cache; a folder for each choice of options but the number of episodes."""
     from dmcvb_gen.policies.archives import cache_folders
 
-    decide = {key: str(value) for key, value in options.items() if key not in ("workers", "progress")}
+    leave_out = ("workers", "progress", "other_versions")
+    decide = {key: str(value) for key, value in options.items() if key not in leave_out}
+    for key in decide.keys() & {"backgrounds", "behaviour"}:
+        path = Path(decide[key])
+        decide[key] = str(path.absolute() if path.exists() else path)  # the same words mean others elsewhere
     mark = hashlib.sha256(json.dumps([task, levels, decide], sort_keys=True).encode()).hexdigest()[:12]
     folder = cache_folders()[0].parent / "made" / mark
     return rollout((task,), levels=levels, episodes=episodes, out=folder, **options)

@@ -27,7 +27,7 @@ from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictur
 from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing
-from dmcvb_gen.generate.inputs import video_source
+from dmcvb_gen.generate.inputs import shown_videos
 from dmcvb_gen.generate.recipe import NATIVE
 from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.options import Count, Seed, Split, checked
@@ -138,7 +138,7 @@ class EvaluationScene:
     def of(cls, subset: Subset, backgrounds: str | None = None) -> EvaluationScene:
         """Return the scene of a subset; `backgrounds`: the videos' folder, if it is not where the manifest says."""
         record, (renderer, samples) = subset.record, renderer_choice(subset).values()
-        source = video_source(subset.release.path, record, backgrounds)
+        source = shown_videos(subset, backgrounds)
         shown = (training_pictures(subset), record.size, renderer, samples, source)
         return cls(subset.task, subset.setting, *shown, action_repeat=record.action_repeat)
 
@@ -388,8 +388,10 @@ def evaluate(
             _check_sizes(evaluator, policy)
         _tell_differences(scene, evaluator, seen)
         score = evaluator.score(policy)
-    if isinstance(where, Subset) and score.limit == where.record.max_steps:
-        return replace(score, normalized=normalized(score.mean, reference_returns(where.release, where.record)))
+    if isinstance(where, Subset):
+        record = where.record
+        if (score.limit, scene.action_repeat) == (record.max_steps, record.action_repeat):
+            return replace(score, normalized=normalized(score.mean, reference_returns(where.release, record)))
     return score
 
 

@@ -107,10 +107,12 @@ class Subset:
       record: its entry in the manifest.
       fresh: True if each epoch shows other distractors.
       epoch: epoch of the distractors; 0 if they are those of the data.
+      other_videos: folder of the videos that are shown, or "builtin"; None for those that the release names.
       looks: settings whose images stand side by side in each array of images; 1 but for `paired`.
     """
 
     fresh = False
+    other_videos: str | None = None
     epoch = 0
     looks = 1
 

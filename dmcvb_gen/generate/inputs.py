@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dmcvb_gen.dataset.manifest import FileRecord, SubsetRecord
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, StoreError
 from dmcvb_gen.files import sha256_file
@@ -104,6 +105,20 @@ def background_source(root: str | Path, record: SubsetRecord, moved: str | None 
             "those (--backgrounds), or show others: `dmcvb-gen repaint`"
         )
     return given
+
+
+def shown_videos(subset: Subset, moved: str | None = None) -> str:
+    """Return "builtin" or the folder of the videos that a subset shows; those of a URL are fetched.
+
+    Args:
+      moved: folder of the videos, instead of the manifest's.
+    """
+    release, record = subset.release, subset.record
+    if record.distractor.kind != "none":
+        moved = moved or subset.other_videos
+    if moved or (record.backgrounds or {}).get("source", BUILTIN) == BUILTIN:
+        return moved or BUILTIN
+    return video_source(local_inputs(release.store, release.inputs_of([subset.name])), record)
 
 
 def video_source(root: str | Path, record: SubsetRecord, moved: str | None = None) -> str:

@@ -129,7 +129,7 @@ def start(plan: Plan, other_versions: bool = False, command: str = "rollout") ->
     Raises:
       StoreError: what is there contradicts this recipe or was begun with other versions, or it cannot be written.
     """
-    if plan.there and not other_versions:
+    if plan.works and plan.there and not other_versions:
         check_versions(plan.store)
     if plan.resolution is not None:
         begin(plan.store, plan.resolution.resolved, plan.resolution.files)

@@ -34,7 +34,7 @@ class ComputedArray:
         first, *rest = without_ellipsis(selection, self.ndim)
         episodes = np.arange(self.shape[0])[first]
         if np.ndim(episodes) == 0:
-            return self._compute(int(episodes), tuple(rest))
+            return self._compute(int(episodes), tuple(rest)).copy()  # what is kept stays as it is
         return self.rows(np.asarray(episodes))[(slice(None), *rest)]
 
     def outer(self, selection: tuple) -> np.ndarray:
@@ -61,6 +61,7 @@ class JoinedArray(ComputedArray):
         first, self._parts, self._starts = parts[0], parts, starts
         shape = (sum(part.shape[0] for part in parts), *first.shape[1:])
         super().__init__(first.name, shape, first.dtype, first.dimensions, self._of_episode)
+        self.attributes = first.attributes
 
     def _of_episode(self, episode: int, rest: tuple) -> np.ndarray:
         part = int(np.searchsorted(self._starts, episode, "right")) - 1
@@ -87,4 +88,8 @@ class PairedArray(ComputedArray):
 
     def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
         """See `ComputedArray.rows`."""
-        return np.stack([part.rows(episodes, rows) for part in self._parts], axis=2)
+        (_, steps, *rest), episodes = self.shape, np.asarray(episodes)
+        joined = np.empty((len(episodes), len(range(steps)[:rows]), *rest), self.dtype)
+        for index in np.ndindex(len(episodes), len(self._parts)):
+            joined[index[0], :, index[1]] = self._parts[index[1]].rows(episodes[index[0], None], rows)[0]
+        return joined

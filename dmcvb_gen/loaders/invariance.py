@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.paired import PairedReader
 
@@ -45,8 +46,9 @@ def evaluate_invariance(
     **options: Any,
 ) -> Invariance:
     """See `PairedReader.evaluate_invariance`."""
-    if len(pairs) < 2:
-        raise DmcvbError(f"{pairs.name} has {len(pairs)} episodes; a probe needs 2, to learn from and to be tested on")
+    if min(len(pairs), episodes, states) < 2:
+        what = f"{pairs.name} has {len(pairs)} episodes, of which {episodes} with {states} states are asked for"
+        raise DmcvbError(f"{what}; a probe needs 2 of both, to learn from and to be tested on")
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.permutation(pairs.episodes)[:episodes])
     source = pairs.source(episodes=chosen, in_memory=True, **options)
@@ -55,13 +57,13 @@ def evaluate_invariance(
     features = [_encoded(encoder, batch["pixels"][:, look]) for look in range(pairs.looks)]
     scaled = np.split(_scaled(np.concatenate(features)), pairs.looks)
     places = np.searchsorted(chosen, batch["episode"]), batch["step"]
-    labels = [_real(part.labels(chosen)[places]) for part in pairs.parts]
+    labels = _real([part.labels(chosen)[places] for part in pairs.parts])
     everywhere, looks = np.concatenate(scaled), np.tile(tested, pairs.looks)
     return Invariance(
         float(np.mean([_found(one, other) for one in scaled for other in scaled if one is not other])),
         1 / count,
         _probe(everywhere, np.tile(batch["state"], (pairs.looks, 1)), looks),
-        _probe(everywhere, np.concatenate(labels), looks),
+        _probe(everywhere, labels, looks),
     )
 
 
@@ -79,10 +81,12 @@ def _scaled(values: np.ndarray) -> np.ndarray:
     return (values[:, varies] - values[:, varies].mean(axis=0)) / std[varies]
 
 
-def _real(labels: Any) -> np.ndarray:
-    """(image, label) of the labels that are real numbers."""
-    real = [value for _, value in labels.items() if value.dtype.kind == "f"]
-    return np.concatenate([value.reshape(len(value), -1) for value in real], axis=1).astype(float)
+def _real(looks: Sequence[DistractorState]) -> np.ndarray:
+    """(look * image, label) of the labels that are real numbers; one that a look does not vary is zero in it."""
+    labels = [dict(look.items()) for look in looks]
+    real = {name: value for look in labels for name, value in look.items() if value.dtype.kind == "f"}
+    found = [np.concatenate([look.get(name, 0 * value) for look in labels]) for name, value in real.items()]
+    return np.concatenate([value.reshape(len(value), -1) for value in found], axis=1).astype(float)
 
 
 def _found(one: np.ndarray, other: np.ndarray) -> float:

@@ -6,7 +6,7 @@ from typing import Any
 
 from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
-from dmcvb_gen.generate.inputs import BUILTIN, video_source
+from dmcvb_gen.generate.inputs import BUILTIN, shown_videos
 from dmcvb_gen.loaders.envs import DistractedEnv, DistractedVectorEnv
 from dmcvb_gen.spec import FIXED
 from dmcvb_gen.tasks import ACTION_REPEAT
@@ -17,8 +17,8 @@ def matching_environment(
 ) -> DistractedEnv | DistractedVectorEnv:
     """See `SubsetReader.environment`."""
     given = environment_options(subset, split) | {"stack": stack}
-    if own_videos(subset):
-        given["backgrounds"] = video_source(subset.release.path, subset.record)
+    if (videos := shown_videos(subset)) != BUILTIN:
+        given["backgrounds"] = videos
     given |= options
     return DistractedEnv(**given) if num_envs is None else DistractedVectorEnv(num_envs, **given)
 

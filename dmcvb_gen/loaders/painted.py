@@ -7,6 +7,7 @@ colors, before other videos, all drawn from named streams: augmentation that kee
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -16,15 +17,14 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import SubsetRecord
+from dmcvb_gen.dataset.manifest import ArraySpec, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_of
-from dmcvb_gen.dataset.reader import StoredArray
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
-from dmcvb_gen.generate.resolve import all_pictures, stream_names
+from dmcvb_gen.generate.resolve import all_pictures, labels_layer, stream_names
 from dmcvb_gen.loaders.arrays import ComputedArray
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
@@ -74,6 +74,7 @@ class PaintedSubset(SubsetReader):
         # What is stored may be of another size, or without pictures; this subset says what can be read of it.
         super().__init__(release, record.model_copy(update={"size": painting.size or record.size}))
         self.painting, self.fresh = painting, painting.distractors == RESAMPLED
+        self.other_videos = painting.backgrounds
         self._other_frames = self.fresh or self.record.size != record.size
         self._start()
 
@@ -103,8 +104,11 @@ class PaintedSubset(SubsetReader):
 
     @property
     def arrays(self) -> tuple[str, ...]:
-        unlike = stored_in(super().arrays) if self._other_frames else ()
-        return tuple(sorted({*super().arrays, *self.picture_names} - set(unlike)))
+        stored = super().arrays
+        unlike = set(stored_in(stored)) if self._other_frames else set()
+        if self.fresh:
+            unlike |= {name for name in stored if name.startswith("exogenous/")}
+        return tuple(sorted({*stored, *self.picture_names} - unlike | set(self._fresh_specs)))
 
     def array(self, name: str) -> Any:
         """See `Subset.array`.
@@ -123,25 +127,29 @@ class PaintedSubset(SubsetReader):
                 f"the stored {name} of {self.name} belongs to the images as they were made, not to those with "
                 "distractors='resample' or another size; open the release without these to read it"
             )
-        stored = super().array(name)
-        if not (self.fresh and name.startswith("exogenous/")):
-            return stored
-        label = name.removeprefix("exogenous/")
+        if (spec := self._fresh_specs.get(name)) is None:
+            return super().array(name)
         return ComputedArray(
             name,
-            stored.shape,
-            stored.dtype,
-            stored.dimensions,
-            lambda e, rest: self._shown_label(e, label, stored)[rest],
+            (self.record.episodes, self.record.max_steps + 1, *spec.shape),
+            np.dtype(spec.dtype),
+            ("episode", "step", *spec.dims),
+            lambda e, rest: self._shown_label(e, spec)[rest],
         )
 
-    def _shown_label(self, episode: int, label: str, stored: StoredArray) -> np.ndarray:
+    @functools.cached_property
+    def _fresh_specs(self) -> dict[str, ArraySpec]:
+        """The labels that are drawn afresh, by name; its setting may vary more or less than what is stored."""
+        layer = labels_layer(self.record, self.trajectories)
+        return {spec.name: spec for spec in layer.arrays} if self.fresh else {}
+
+    def _shown_label(self, episode: int, spec: ArraySpec) -> np.ndarray:
         """Values of a fresh label, rows past the episode's end zero."""
         self._check_episode(episode)
         rows = int(self.read("length", [episode])[0]) + 1
-        values = np.zeros(stored.shape[1:], stored.dtype)
+        values = np.zeros((self.record.max_steps + 1, *spec.shape), spec.dtype)
         with self._lock:
-            values[:rows] = getattr(self._fresh_labels(episode), label)[:rows]
+            values[:rows] = getattr(self._fresh_labels(episode), spec.name.removeprefix("exogenous/"))[:rows]
         return values
 
     def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
@@ -191,7 +199,7 @@ class PaintedSubset(SubsetReader):
         labels = self._fresh_labels(episode)[None, :used] if self.fresh else self.labels(index)[:, :used]
         task, rows = get_task(self.task), self.record.max_steps + 1
         pictures = paint(task, renderer, physics, labels, length, rows, arrays=arrays)
-        return {name: value[0].copy() for name, value in pictures}
+        return {name: value[0] for name, value in pictures}
 
     def _open_painter(self) -> tuple[Renderer, Any]:
         if self._painter is None:

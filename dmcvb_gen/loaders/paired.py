@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -70,6 +70,9 @@ class PairedReader(SubsetReader):
             return super().array(name)
         return PairedArray(name, [part.array(*_image(part, found[0])) for part in self.parts])
 
+    def labels(self, episodes: Any = None) -> NoReturn:
+        raise DmcvbError(f"{self.name} has labels for each setting: [part.labels(...) for part in subset.parts]")
+
     def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
         views = [found[0] for name in pictures if (found := picture_of(name))]
         for part in self.parts:
@@ -89,9 +92,9 @@ def _under(subset: SubsetReader, spec: SubsetSpec, name: str, again: bool) -> Su
     if again or not (shared or spec.goal):
         if record.imported:
             raise StoreError(f"{subset.name} was imported and cannot be rendered; name settings that the release holds")
-        return PaintedSubset(release, look, Painting(RESAMPLED))
+        return PaintedSubset(release, look, Painting(RESAMPLED, backgrounds=subset.other_videos))
     if shared:  # else a maze, whose images have the goal and leave it out
         look = stored.record
     part: SubsetReader = release._subset(look)
     whole = not part.unpainted.any() and set(shown(part).arrays) <= set(part.arrays)
-    return part if whole else PaintedSubset(release, look, Painting())
+    return part if whole else PaintedSubset(release, look, Painting(backgrounds=subset.other_videos))

@@ -24,7 +24,12 @@ class SubsetReader(Subset):
     """A subset with the forms that training code wants; see `Subset` for the rest.
 
     `len(subset)` counts the episodes that are here, `subset[0]` is the first of them.
+
+    Attributes:
+      parts: subsets that it is a union of, or that it sets side by side.
     """
+
+    parts: tuple[SubsetReader, ...] = ()
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """The arrays of the `index`-th episode that is here, see `episode`; negative ones count from the end."""
@@ -33,6 +38,7 @@ class SubsetReader(Subset):
     def part(self, episodes: Iterable[int]) -> Self:
         """The same subset with these episodes alone, in this order: indices, or a mask (`subset.returns > 900`)."""
         chosen = copy.copy(self)
+        chosen.parts = tuple(copy.copy(part) for part in self.parts)  # each with an epoch of its own
         for name in ("lengths", "returns"):
             chosen.__dict__.pop(name, None)
         chosen.__dict__["_episodes"] = self.choose(episodes)

@@ -53,7 +53,8 @@ def test_a_policy_is_scored_as_its_data_are_and_normalized_by_them(levels):
     assert score.returns == by_name.returns and by_name.normalized is None
     low, high = (Release.open(folder)[name].read("return").mean() for name in (random, expert))
     assert score.normalized == pytest.approx(100 * (score.mean - low) / (high - low))
-    assert release[expert].evaluate(still, episodes=1, max_steps=3, pixels=False).normalized is None
+    for other in ({"max_steps": 3}, {"action_repeat": 4}):
+        assert release[expert].evaluate(still, episodes=1, pixels=False, **other).normalized is None
     told = {subset["name"]: subset["normalized"] for subset in describe_release(folder)["subsets"]}
     assert (told[random], told[expert]) == pytest.approx((0, 100))
 
@@ -63,6 +64,8 @@ def test_what_cannot_be_made_or_scored_is_refused_in_a_line(levels, small_mazes)
     fixed = dmcvb_gen.open(small_mazes)["ant-maze-tiny/random/fixed"]
     for call, words in (
         (lambda: dmcvb_gen.make("walker-walk"), "'walker-walk' names no subset; give TASK/LEVEL/SETTING"),
+        (lambda: dmcvb_gen.make(random, levels="expert"), "make\\(\\) decides levels by the name"),
+        (lambda: dmcvb_gen.make(random, release=folder, episodes=100), "has . of 100 episodes; give fewer"),
         (lambda: dmcvb_gen.make(random, release=folder, size=32), "size has no effect: with a release"),
         (lambda: dmcvb_gen.make(random, release=folder, episodes=1), "has 1 episodes; give 2 or more"),
         (lambda: dmcvb_gen.make(random, release=folder, held_out=1.5), "held_out is 1.5"),

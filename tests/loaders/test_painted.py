@@ -131,6 +131,8 @@ def test_painted_episodes_are_kept_while_there_is_room(painted_and_light):
     subset = next(iter(dmcvb_gen.open(str(painted_and_light / "light"), paint=True).subsets.values()))
     name = subset.picture_names[0]
     assert subset.painted(0, [name])[name] is subset.painted(0)[name]
+    subset.array(name)[0][:] = subset.episode(0, [name])[name][:] = 0
+    assert subset.painted(0)[name].any()  # what is read is the reader's, and may be changed
     subset.painting.__dict__["cache_bytes"] = 1
     first = subset.painted(1, [name])[name]
     assert subset.painted(2) and subset.painted(1, [name])[name] is not first

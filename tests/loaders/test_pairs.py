@@ -126,8 +126,21 @@ def test_invariance_of_encoders_that_know_the_answer(pairs):
     assert nothing.chance == 1 / 96 and nothing.retrieval < 0.1 and max(nothing.state, nothing.distractors) < 0.1
 
 
-def test_a_probe_of_one_episode_is_refused(pairs):
+def test_settings_may_have_other_labels_and_parts_have_their_own_epochs(pairs):
+    looks = pairs.release["walker-walk/random/none"].paired("none", "dynamic_light0.5")
+    assert looks.parts[1].labels([0]).light_shift.any() and looks.parts[0].labels([0]).light_shift is None
+    assert looks.evaluate_invariance(lambda pixels: pixels.reshape(len(pixels), -1)[:, :64]).distractors < 1
+    one, other = looks.part([0]), looks.part([1])
+    before = other.array("pixels")[1]
+    one.set_epoch(1)
+    assert np.array_equal(other.array("pixels")[1], before)
+    assert not np.array_equal(one.array("pixels")[0], looks.array("pixels")[0])
+
+
+def test_a_probe_of_one_episode_and_labels_of_all_settings_are_refused(pairs):
     one = pairs.part([0])
     assert len(one) == 1 and one.steps == 12
-    with pytest.raises(DmcvbError, match="has 1 episodes; a probe needs 2"):
+    with pytest.raises(DmcvbError, match="has 1 episodes, .*; a probe needs 2"):
         one.evaluate_invariance(lambda pixels: pixels)
+    with pytest.raises(DmcvbError, match="has labels for each setting"):
+        one.labels()

@@ -43,10 +43,12 @@ def write(source: Source, folder: Path) -> None:
     name = folder_name(subset.name)
     picture = spaces.Box(0, 255, (size, size, 3 * len(source.views)), np.uint8)
     state = spaces.Box(-np.inf, np.inf, (subset.array("state").shape[-1],), np.float32)
+    shape, bounds = subset.array("action").shape[-1:], subset.spec("action").attributes
+    low, high = (np.full(shape, bounds.get(name, one), np.float32) for name, one in (("low", -1), ("high", 1)))
     storage = MinariStorage.new(
         folder / "data",
         observation_space=spaces.Dict({"pixels": picture, "state": state}),
-        action_space=spaces.Box(-1.0, 1.0, (subset.array("action").shape[-1],), np.float32),
+        action_space=spaces.Box(low, high, dtype=np.float32),
         env_spec=_environment(source, source.subset.record.split),
         data_format="hdf5",
         jpeg_encoding=False,
