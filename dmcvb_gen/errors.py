@@ -24,7 +24,7 @@ class UnknownNameError(DmcvbError, KeyError):
     Args:
       kind: what is named.
       known: all names; of those that begin with `name`, the first one is the nearest.
-      cure: what lists all of them, if there is such a thing.
+      cure: what lists all of them, or adds one, if there is such a thing.
     """
 
     def __init__(self, kind: str, name: object, known: Iterable[str], cure: str = ""):
@@ -36,8 +36,8 @@ class UnknownNameError(DmcvbError, KeyError):
         listed, rest = known, ""
         if len(known) > MOST_LISTED:
             listed = difflib.get_close_matches(str(name), known, n=MOST_LISTED // 3, cutoff=0)
-            rest = f" and {len(known) - len(listed)} more{cure and f'; {cure}'}"
-        super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(listed)}{rest}.")
+            rest = f" and {len(known) - len(listed)} more"
+        super().__init__(f"unknown {kind} {str(name)!r}.{hint} Known: {', '.join(listed)}{rest}{cure and f'; {cure}'}.")
 
     def __str__(self) -> str:  # KeyError would print the repr
         return str(self.args[0])

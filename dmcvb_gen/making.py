@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from annotated_types import Gt, Lt
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.options import (
     Count,
     Local,
@@ -26,7 +26,7 @@ from dmcvb_gen.options import (
 )
 from dmcvb_gen.parallel import Workers
 from dmcvb_gen.spec import SubsetSpec, is_maze, subset_name
-from dmcvb_gen.text import as_names
+from dmcvb_gen.text import as_names, quoted
 
 if TYPE_CHECKING:
     from dmcvb_gen.generate.paint import RenderResult
@@ -197,7 +197,10 @@ def _cached(task: str, levels: tuple[str, ...], episodes: int | None, options: d
         decide[key] = str(path.absolute() if path.exists() else path)  # the same words mean others elsewhere
     mark = hashlib.sha256(json.dumps([task, levels, decide], sort_keys=True).encode()).hexdigest()[:12]
     folder = cache_folders()[0].parent / "made" / mark
-    return rollout((task,), levels=levels, episodes=episodes, out=folder, **options)
+    try:
+        return rollout((task,), levels=levels, episodes=episodes, out=folder, **options)
+    except StoreError as error:
+        raise StoreError(f"{error}; make() keeps its data in {quoted(folder)}, which may be removed") from None
 
 
 @checked
@@ -304,7 +307,7 @@ def regenerate(
 
     Args:
       release (RELEASE): Folder of the release.
-      manifest (NAME|FILE): A shipped manifest, or the manifest.json.xz of a card, instead of a release.
+      manifest (NAME|FILE): A shipped manifest, or a file of one, instead of a release.
       only (PATTERN): Regenerate only these subsets.
       episode_range (RANGE): Use only the shards with episodes A to B - 1.
       check: Compare digests and change nothing.

@@ -150,7 +150,8 @@ class DistractorSetting:
 
     def __post_init__(self) -> None:
         if self.kind not in DISTRACTOR_KINDS and self.kind not in distractor_kinds():
-            raise UnknownNameError("distractor", self.kind, distractor_kinds())
+            own = f"one of your own needs {DISTRACTORS}=MODULE:CLASS"
+            raise UnknownNameError("distractor", self.kind, distractor_kinds(), own)
         object.__setattr__(self, "difficulty", _canonical(self.difficulty))
         if self.difficulty != "medium" and self.kind == "none":
             raise DmcvbError(f"distractor none has no difficulty; {self.difficulty} is for static or dynamic")

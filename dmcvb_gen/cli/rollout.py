@@ -74,7 +74,7 @@ def cluster():
     """
 
 
-WHAT = tuple(name for names in OPTION_GROUPS.values() for name in names)
+WHAT = tuple(name for names in OPTION_GROUPS.values() for name in names if name not in ("only", "episode_range"))
 
 
 @command_of(making.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT), epilog=DISTRACTORS)
@@ -82,7 +82,7 @@ def begin(as_json, progress, **options):
     """Create a release without generating any episodes. The options are those of `rollout`."""
     from dmcvb_gen.generate.plan import start
 
-    plan = _plan(options)
+    plan = _plan(options | {"only": (), "episode_range": None})
     start(plan, command="cluster begin")
     place = quoted(plan.store.place)
     begun = f"begun, {pluralize(len(plan.works), 'shards')} to make: dmcvb-gen cluster part {place} 1/N to N/N"

@@ -34,7 +34,7 @@ from dmcvb_gen.generate.render import (
     renderers,
     videos_of,
 )
-from dmcvb_gen.generate.resolve import stream_names
+from dmcvb_gen.generate.resolve import code_of_distractor, code_of_task, stream_names
 from dmcvb_gen.generate.works import Setting, Work
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
@@ -166,6 +166,7 @@ def _make_setting(work: Work, setting: Setting, episodes: Episodes, tick: Progre
     record, root = setting.record, local_inputs(work.store, work.inputs)
     backgrounds = background_source(root, record, work.backgrounds)
     if makes_labels:
+        _check_code(record.distractor.kind, setting.labels.makes, code_of_distractor(record.distractor))
         labels = _drawn_labels(work, record, episodes, backgrounds)
         yield _settle(work, setting.labels, label_arrays(labels, episodes.length, work.trajectories.rows))
     else:
@@ -189,6 +190,7 @@ def _plain(spec: ArraySpec) -> str:
 def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episodes:
     """Simulate the episodes of a shard."""
     task, makes = get_task(record.task).at(record.action_repeat), work.trajectories.makes
+    _check_code(record.task, makes, code_of_task(record.task))
     pairs = None
     if makes["fixed_goals"]:
         per_goal = makes["episodes_per_goal"]
@@ -208,6 +210,15 @@ def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episod
         max_steps=record.max_steps,
     )
     return Episodes(made.episodes, made.arrays())
+
+
+def _check_code(name: str, makes: Mapping[str, Any], now: Any) -> None:
+    """Raises StoreError if the code of one's own that a layer was begun with is another one now."""
+    if makes.get("code", now) != now:
+        raise StoreError(
+            f"the code of {name} is not what the release was begun with; bring back the file as it was, or give "
+            "another --out"
+        )
 
 
 @functools.lru_cache(maxsize=4)

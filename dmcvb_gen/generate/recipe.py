@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -57,6 +58,7 @@ def _as_tuple(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
 
+Place = Annotated[str, pydantic.AfterValidator(os.path.expanduser)]
 Names = Annotated[tuple[str, ...], pydantic.BeforeValidator(_as_tuple), pydantic.Field(min_length=1)]
 
 
@@ -76,7 +78,7 @@ class SubsetPattern(_Model):
     Attributes:
       settings: distractors for locomotion ("none", "static", "dynamic_hard", ...), goal settings for mazes
         ("visible", "hidden", "fixed").
-      episodes, steps: size of each subset; give one. Steps are for tasks of fixed length.
+      episodes, steps: size of each subset but those with fixed goals; give one. Steps are for tasks of fixed length.
       policies: level -> policy file or run folder, if not the bundled ones.
       deterministic: take the policies' mean actions, as DMC-VB does; false draws samples. Level random is always drawn.
       max_steps: steps at which the time limit ends an episode, if not the task's own (500, mazes 600).
@@ -89,7 +91,7 @@ class SubsetPattern(_Model):
     episodes: int | None = pydantic.Field(default=None, gt=0)
     steps: int | None = pydantic.Field(default=None, gt=0)
     episodes_per_shard: int | None = pydantic.Field(default=None, gt=0, le=1000)
-    policies: dict[str, str] = {}
+    policies: dict[str, Place] = {}
     deterministic: bool = True
     max_steps: int | None = pydantic.Field(default=None, gt=0, le=MAX_STEPS)
     fixed_goals: int = pydantic.Field(default=5, gt=0)
@@ -118,7 +120,7 @@ class Recipe(_Model):
     action_repeat: Literal[1, 2, 4] = 2
     renderer: RendererChoice = RendererChoice()
     trajectories: Literal["shared", "independent"] = "shared"
-    backgrounds: str = "builtin"
+    backgrounds: Place = "builtin"
     split: Literal["train", "val"] = "train"
     subsets: tuple[SubsetPattern, ...] = pydantic.Field(min_length=1)
 
@@ -173,9 +175,9 @@ def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
                     if spec.name in requests:
                         raise RecipeError(f"recipe {recipe.name!r} asks for {spec.name} twice; keep one of the entries")
                     requests[spec.name] = _request(pattern, task, spec)
-    unused = {level for pattern in recipe.subsets for level in pattern.policies if level not in pattern.levels}
-    if unused:
-        raise RecipeError(f"policies are given for level {sorted(unused)[0]!r}, which the recipe does not ask for")
+    for pattern in recipe.subsets:
+        for level in pattern.policies.keys() - {*pattern.levels} | pattern.policies.keys() & {"random"}:
+            raise RecipeError(f"the policy of level {level!r} has no use in this recipe; remove it from policies")
     if (episodes := sum(request.episodes for request in requests.values())) > MAX_EPISODES:
         raise RecipeError(f"recipe {recipe.name!r} comes to {episodes:,} episodes; a release may have {MAX_EPISODES:,}")
     if (shards := sum(map(_shards, requests.values()))) > MAX_SHARDS:

@@ -180,15 +180,19 @@ def remake(
     write_provenance(store, "regenerate")
     target = Release.in_making(store)
     works = works_of(target, names, how.episodes, backgrounds=how.backgrounds)
-    how.run(works, progress)
+    fresh = {(outcome.layer, outcome.shard) for outcome in how.run(works, progress)}
     finish(store)
     made, outcomes = Release.in_making(store), {}
+    shards = {(shard.layer.name, shard.number): shard for shard in made.shards(names, how.episodes)}
     for work in works_of(target, names, how.episodes, wanted=lambda layer, shard: True):
         for layer in (layer for layer in work.layers if layer.name in known.records):
             record, digests = made.records(layer.name).get(work.shard), known.records[layer.name]
             if work.shard < len(digests):
-                equal = record is not None and sha256_bytes(canonical_json(record)) == digests[work.shard]
-                outcomes[layer.name, work.shard] = ShardOutcome.of(layer, work.shard, equal=equal)
+                equal, place = record is not None, (layer.name, work.shard)
+                equal = equal and sha256_bytes(canonical_json(record)) == digests[work.shard]
+                if place not in fresh:  # it was there before, and its files may have changed since
+                    equal = equal and not any(wrong_bytes(store, file) for file in shards[place].files)
+                outcomes[place] = ShardOutcome.of(layer, work.shard, equal=equal)
     return Outcome(tuple(outcomes.values()), {})
 
 

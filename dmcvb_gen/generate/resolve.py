@@ -23,6 +23,7 @@ from dmcvb_gen.dataset.manifest import (
     POLICIES,
     SAID,
     VIDEOS,
+    ArraySpec,
     FileRecord,
     Layer,
     PolicyRecord,
@@ -35,6 +36,7 @@ from dmcvb_gen.dataset.schema import image_array, label_arrays, trajectory_array
 from dmcvb_gen.dataset.writer import file_facts
 from dmcvb_gen.distractor_state import OPTIONAL_LABELS
 from dmcvb_gen.distractors import load_backgrounds
+from dmcvb_gen.distractors.registry import BUILT_IN, distractors_of
 from dmcvb_gen.errors import BackgroundError, RecipeError
 from dmcvb_gen.generate.inputs import BUILTIN
 from dmcvb_gen.generate.modalities import get_modality
@@ -45,7 +47,7 @@ from dmcvb_gen.own_code import is_own, source_digest
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.spec import SPLITS, is_maze
+from dmcvb_gen.spec import SPLITS, DistractorSetting, is_maze
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
@@ -85,14 +87,15 @@ def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -
     files: dict[str, Path] = {}
     layers: dict[str, Layer] = {}
     subsets: list[SubsetRecord] = []
-    policies: dict[str, dict[str, None]] = {}
+    policies: dict[tuple[str, str], dict[str, None]] = {}
     for name, members in sets.items():
         per_shard = _episodes_per_shard(name, members, there)
         for request in members:
             found = request.level != "random" and resolve_policies(request.task, request.level, request.policy) or []
             record = _record(recipe, request, found)
             kept = dict.fromkeys(policy.path or policy.name for policy in record.policies)
-            policies[request.policy or ""] = policies.get(request.policy or "", {}) | kept
+            given = (request.policy or "", request.level)
+            policies[given] = policies.get(given, {}) | kept
             files |= {p.path: path for p, path in zip(record.policies, found, strict=True) if p.path}
             look = (record.task, record.distractor)
             if look not in looks:
@@ -175,7 +178,7 @@ def _layers(recipe: Recipe, record: SubsetRecord, name: str, per_shard: int, pix
     streams = [record.task, record.level] + ([record.setting] if name == record.name else [])
     makes = {
         "task": record.task,
-        "code": source_digest(record.task.partition(":")[0]) if is_own(record.task) else "",
+        "code": code_of_task(record.task),
         "streams": streams,
         "seed": recipe.seed,
         "policies": [policy.digest for policy in record.policies],
@@ -200,21 +203,38 @@ def _layers(recipe: Recipe, record: SubsetRecord, name: str, per_shard: int, pix
 
 def labels_layer(record: SubsetRecord, trajectories: Layer) -> Layer:
     """The layer of a subset's labels, drawn for its trajectories."""
-    varying = [part for part in OPTIONAL_LABELS.values() if record.distractor.varies(part)]
+    code = code_of_distractor(record.distractor)
     return Layer(
         name=f"{record.name}/labels",
         group=f"{trajectories.group.rpartition('/')[0]}/{record.setting}",
         kind="labels",
         rows=trajectories.rows,
         episodes_per_shard=trajectories.episodes_per_shard,
-        arrays=label_arrays(get_task(record.task), varying),
+        arrays=drawn_labels(record),
         makes={
             "of": trajectories.key,
             "distractor": record.distractor.name,
             "split": record.split,
             "videos": (record.backgrounds or {}).get("digest"),
+            **({"code": code} if code else {}),
         },
     )
+
+
+def code_of_task(task: str) -> str:
+    """The digest of the file of a task of one's own, else ""."""
+    return source_digest(task.partition(":")[0]) if is_own(task) else ""
+
+
+def code_of_distractor(setting: DistractorSetting) -> list[str]:
+    """Digests of the files of distractors of one's own that vary under a setting."""
+    return [source_digest(part.__module__) for part in distractors_of(setting) if part not in BUILT_IN]
+
+
+def drawn_labels(record: SubsetRecord) -> tuple[ArraySpec, ...]:
+    """The arrays of the labels that a subset's distractors draw."""
+    varying = [part for part in OPTIONAL_LABELS.values() if record.distractor.varies(part)]
+    return label_arrays(get_task(record.task), varying)
 
 
 def all_pictures(record: SubsetRecord) -> tuple[str, ...]:
@@ -280,7 +300,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
         layers=("none-yet",),
         size=recipe.size,
         deterministic=request.deterministic,
-        policies=tuple(_policy_record(path, task) for path in files),
+        policies=tuple(_policy_record(path, task, request.level) for path in files),
         renderer={"name": recipe.renderer.backend, "samples": recipe.renderer.samples},
         family=task.family,
         views=tuple(task.views),
@@ -308,8 +328,10 @@ def _tell_of_held_actions(recipe: Recipe, subsets: Iterable[SubsetRecord]) -> No
             )
 
 
-def _policy_record(path: Path, task: Task) -> PolicyRecord:
+def _policy_record(path: Path, task: Task, level: str) -> PolicyRecord:
     policy = load_policy(path, task)
+    if policy.header.level not in (None, level):
+        raise RecipeError(f"{path} is a policy of level {policy.header.level}, not {level}; ask for that --level")
     header = policy.header.model_dump(mode="json")
     header["training"].pop("curve", None)  # long, and in the policy's file
     if policy.header.algorithm == OWN_CODE:
@@ -352,12 +374,12 @@ def video_files(shown: Mapping[str, Any] | None, source: str) -> dict[str, Path]
 
 
 def _without_local_paths(
-    recipe: Recipe, policies: Mapping[str, Iterable[str]], subsets: Iterable[SubsetRecord]
+    recipe: Recipe, policies: Mapping[tuple[str, str], Iterable[str]], subsets: Iterable[SubsetRecord]
 ) -> dict[str, Any]:
     """The recipe as the release keeps it: files and folders of this machine go by the release's copies."""
     data = recipe.model_dump(mode="json")
     for pattern in data["subsets"]:
-        pattern["policies"] = {level: ",".join(policies[given]) for level, given in pattern["policies"].items()}
+        pattern["policies"] = {level: ",".join(policies[given, level]) for level, given in pattern["policies"].items()}
     shown = {record.backgrounds["source"] for record in subsets if record.backgrounds}
     data["backgrounds"] = shown.pop() if shown else BUILTIN
     return data

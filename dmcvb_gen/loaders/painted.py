@@ -24,7 +24,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
-from dmcvb_gen.generate.resolve import all_pictures, labels_layer, stream_names
+from dmcvb_gen.generate.resolve import all_pictures, drawn_labels, stream_names
 from dmcvb_gen.loaders.arrays import ComputedArray
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
@@ -140,8 +140,7 @@ class PaintedSubset(SubsetReader):
     @functools.cached_property
     def _fresh_specs(self) -> dict[str, ArraySpec]:
         """The labels that are drawn afresh, by name; its setting may vary more or less than what is stored."""
-        layer = labels_layer(self.record, self.trajectories)
-        return {spec.name: spec for spec in layer.arrays} if self.fresh else {}
+        return {spec.name: spec for spec in drawn_labels(self.record)} if self.fresh else {}
 
     def _shown_label(self, episode: int, spec: ArraySpec) -> np.ndarray:
         """Values of a fresh label, rows past the episode's end zero."""

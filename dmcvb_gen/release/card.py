@@ -310,11 +310,14 @@ def _limits(release: Release, facts: dict[str, Any]) -> list[str]:
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
     limits += _lacking_videos(release)
     policies = {policy.digest: policy for record in manifest.subsets for policy in record.policies}.values()
-    own = [policy for policy in policies if policy.header.get("algorithm") == OWN_CODE]
+    own = {f"Behaviour `{p.name}`": p.digest for p in policies if p.header.get("algorithm") == OWN_CODE}
+    for layer in release.layers.values():
+        if code := layer.makes.get("code"):
+            what = "task" if layer.kind == "trajectories" else "distractor"
+            own[f"{what.capitalize()} `{layer.makes[what]}`"] = code if what == "task" else ", ".join(code)
     limits += [
-        f"Behaviour `{policy.name}` is code (SHA-256 of its source file: `{policy.digest}`): its data are not "
-        "regenerable without that code."
-        for policy in own
+        f"{name} is code (SHA-256 of its source file: `{digest}`): its data are not regenerable without that code."
+        for name, digest in own.items()
     ]
     if algorithms := {str(policy.header.get("algorithm", "unknown means")) for policy in policies} - {OWN_CODE}:
         how = " and ".join(origin_of(name) for name in sorted(algorithms))

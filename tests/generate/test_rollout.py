@@ -206,7 +206,8 @@ NONSENSE_OF_SUBSETS = [
     ({"episodes": 10**7}, "shards.*give more episodes_per_shard"),
     ({"episodes": None}, "say how much"),
     ({"steps": 500}, "not both"),
-    ({"policies": {"expert": "x"}}, "does not ask for"),
+    ({"policies": {"expert": "x"}}, "has no use"),
+    ({"policies": {"random": "x"}}, "has no use"),
     ({"levels": "expert", "policies": {"expert": "/nowhere.safetensors"}}, "nowhere"),
 ]
 SUBSET = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2}
