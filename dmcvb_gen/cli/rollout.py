@@ -20,7 +20,7 @@ OPTION_GROUPS = {
     "Images": ("size", "renderer", "samples", "backgrounds", "split", "pixels"),
     "Where": ("out", "storage_options"),
 }
-"""Heading -> options of `rollout --help` and `cluster begin --help`."""
+"""Heading -> options of `rollout --help`."""
 DISTRACTORS = """
 \b
 Distractors:
@@ -74,10 +74,11 @@ def cluster():
     """
 
 
-WHAT = tuple(name for names in OPTION_GROUPS.values() for name in names if name not in ("only", "episode_range"))
+NOT_BEGUN = {"only", "episode_range"}  # whole recipes are begun
+BEGUN = {heading: tuple(one for one in names if one not in NOT_BEGUN) for heading, names in OPTION_GROUPS.items()}
 
 
-@command_of(making.rollout, groups=OPTION_GROUPS, only=("tasks", *WHAT), epilog=DISTRACTORS)
+@command_of(making.rollout, groups=BEGUN, only=("tasks", *sum(BEGUN.values(), ())), epilog=DISTRACTORS)
 def begin(as_json, progress, **options):
     """Create a release without generating any episodes. The options are those of `rollout`."""
     from dmcvb_gen.generate.plan import start

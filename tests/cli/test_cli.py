@@ -16,6 +16,7 @@ from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.policies.bundled import bundled_policies
+from dmcvb_gen.policies.policy_file import load_policy, save_policy
 from dmcvb_gen.training.settings import ALGORITHMS, settings_class
 from tests.conftest import invoke, python, told
 from tests.distractors.test_backgrounds import write_video
@@ -125,8 +126,11 @@ def test_nothing_that_was_half_begun_prints_a_traceback_when_a_command_is_stoppe
 def test_a_level_has_one_behaviour_in_a_release(tmp_path):
     expert = [*TINY, "--level", "expert", "--out", tmp_path / "a"]
     said(*expert)
-    other = ["--distractor", "static", "--behaviour", bundled_policies("walker-walk", "medium")[0]]
-    refused = said(*expert, *other, code=2)
+    medium, other = bundled_policies("walker-walk", "medium")[0], tmp_path / "other.safetensors"
+    assert "is a policy of level medium, not expert" in said(*expert, "--behaviour", medium, code=2)
+    policy = load_policy(medium)
+    save_policy(other, policy.header.model_copy(update={"level": None}), policy.weights)
+    refused = said(*expert, "--distractor", "static", "--behaviour", other, code=2)
     assert "walker-walk/expert/trajectories has policies" in refused and "choose another --out" in refused
     assert "their returns cannot be compared" in said("info", tmp_path / "a")  # with the paper's, which are longer
 
