@@ -79,6 +79,18 @@ def test_parts_and_repeated_begins_obey_the_renderer_of_the_begun_release(tmp_pa
     assert [record.renderer["name"] for record in Release.open(tmp_path / "r").manifest.subsets] == ["native"]
 
 
+OWN = {"tests.tasks.hostile_tasks:plain": "none", "walker-walk": "docs.examples.extending.distractor:Grey"}
+
+
+@pytest.mark.parametrize("task", OWN)
+def test_parts_notice_that_code_of_ones_own_has_changed(task, tmp_path, monkeypatch):
+    words = [task, "--distractor", OWN[task], "--level", "random", "--episodes", 1, "--max-steps", 3]
+    run("cluster", "begin", *words, "--out", tmp_path / "r")
+    monkeypatch.setattr(resolve, "source_digest", lambda module: "0" * 64)
+    refused = invoke("cluster", "part", tmp_path / "r", "1/1", code=2).output
+    assert f"the code of {'grey' if OWN[task] != 'none' else task} is not what" in refused
+
+
 @pytest.mark.slow
 def test_a_ray_cluster_makes_the_same_release_and_lets_own_tasks_run(whole, tmp_path, monkeypatch):
     pytest.importorskip("ray")
