@@ -67,6 +67,11 @@ def allow(names: Iterable[str], variable: str = TASKS) -> None:
         os.environ[variable] = ",".join(dict.fromkeys([*allowed(variable), *own]))
 
 
+def leave_of(task: str | None) -> str:
+    """What lets a task of one's own run in a command that does not name it, to write before that command."""
+    return f"{TASKS}={task} " if task and is_own(task) else ""
+
+
 def permissions() -> dict[str, str]:
     """The environment variables that let code run here, for workers that do not inherit them."""
     return {name: os.environ[name] for name in (TASKS, BEHAVIOURS, DISTRACTORS, PLUGINS) if name in os.environ}

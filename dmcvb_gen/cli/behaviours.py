@@ -15,7 +15,9 @@ from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.errors import PolicyFileError
 from dmcvb_gen.generate.returns import evaluate_behaviour as evaluate
 from dmcvb_gen.options import Local, Location
+from dmcvb_gen.own_code import leave_of
 from dmcvb_gen.progress import ProgressBar
+from dmcvb_gen.spec import task_folder
 from dmcvb_gen.text import quoted
 from dmcvb_gen.training.behaviour import train_behaviour as train
 
@@ -36,7 +38,7 @@ def train_behaviour(as_json, list_settings, **options):
     dmcvb-gen train-behaviour cheetah-run --algo sb3:TQC --list-settings
     dmcvb-gen train-behaviour cheetah-run --algo sb3:TQC --set gradient_steps=8
     dmcvb-gen train-behaviour ant-maze-medium7x7a --algo guided --out runs/ant
-    dmcvb-gen train-behaviour --layout ring.txt --out runs/ring
+    dmcvb-gen train-behaviour ring.txt
     dmcvb-gen select-checkpoints runs/walker-walk
     """
     from dmcvb_gen.training.run import Stopped
@@ -55,28 +57,21 @@ def train_behaviour(as_json, list_settings, **options):
         return print_json(facts | ({"selection": selection_json(picked)} if picked else {}))
     click.echo(f"Trained to {run.steps:,} agent steps: {run.curve}")
     if not picked:
-        return click.echo(f"Next: {_leave(options['task'])}dmcvb-gen select-checkpoints {quoted(run.folder)}")
+        return click.echo(f"Next: {leave_of(options['task'])}dmcvb-gen select-checkpoints {quoted(run.folder)}")
     _show_picks(picked, run.folder)
     if "expert" in picked.picks:
-        maze = options["layout"] or picked.task
-        options = f"{quoted(maze)} --level expert --behaviour {quoted(run.folder)}"
+        options = f"{quoted(options['task'] or picked.task)} --level expert --behaviour {quoted(run.folder)}"
         click.echo(f"Next: dmcvb-gen rollout {options}")
 
 
-def _leave(task):
-    """What lets a task of one's own run in a command that does not name it, to write before that command."""
-    from dmcvb_gen.own_code import TASKS, is_own
-
-    return f"{TASKS}={task} " if task and is_own(task) else ""
-
-
-def _list_settings(as_json, *, task, layout, algo, settings, **_):
+def _list_settings(as_json, *, task, algo, settings, **_):
     """Print every setting, its value for the task and what it means."""
-    from dmcvb_gen.tasks import get_task
-    from dmcvb_gen.training.behaviour import task_of
+    from dmcvb_gen.tasks import get_task, typed_task
+    from dmcvb_gen.training.behaviour import own_maze
     from dmcvb_gen.training.settings import check_settings, default_run, describe_settings, parse_settings
 
-    task, algorithm = get_task(task_of(task, layout)).id, algo or ("guided" if layout else "sac")
+    task = get_task(typed_task(task)).id
+    algorithm = algo or ("guided" if own_maze(task) else "sac")
     given = parse_settings(settings, algorithm)
     values = dataclasses.asdict(check_settings(algorithm, default_run(task, algorithm)["settings"] | given))
     meanings = describe_settings(algorithm)
@@ -117,8 +112,6 @@ def select_checkpoints(run, episodes, as_json):
 
 
 def _show_picks(picked, run):
-    from dmcvb_gen.spec import task_folder
-
     _tell(f"{task_folder(picked.task)}: return at convergence {picked.convergence.standing}")
     picks = [pick for level in picked.picks.values() for pick in level]
     if picks:
@@ -160,17 +153,16 @@ def _converted(
       actions: Plain networks: how the output becomes an action in [-1, 1].
       statistics (FILE): .npz with "mean" and "std" of normalized observations, in the policy's own order.
     """
-    from dmcvb_gen.own_code import allow
     from dmcvb_gen.policies.bundled import CONVERTED
     from dmcvb_gen.policies.convert import convert_file
     from dmcvb_gen.storage.places import local_path
+    from dmcvb_gen.tasks import typed_task
 
-    allow([task])  # a person typed its name, so its code may run
     if Path(out).suffix in CONVERTED:
         raise PolicyFileError(f"--behaviour would take {out} for another program's file; end its name in .safetensors")
     distribution = actions and {"tanh": "deterministic", "clip": "gaussian"}[actions]
     options = dict(level=level, activation=activation, distribution=distribution, statistics=statistics)
-    return convert_file(Path(source), task, local_path(out), **options)
+    return convert_file(Path(source), typed_task(task), local_path(out), **options)
 
 
 @command_of(_converted, "source", "task")
@@ -221,7 +213,7 @@ def _show_returns(rows, episodes, seed):
         if "success" in row:
             extra = [f"{row['success']:.0%}", "-" if row["speed"] is None else f"{row['speed']:.2f}"]
         level = row["behaviour"] or row["level"]
-        lines.append((row["task"], level, *(f"{row['returns'][key]:.1f}" for key in statistics), *extra))
+        lines.append((task_folder(row["task"]), level, *(f"{row['returns'][key]:.1f}" for key in statistics), *extra))
         if row["paper"]:
             numbers = [f"{row['paper'][key]:.1f}" for key in statistics]
             lines.append(("  DMC-VB paper", row["level"], *numbers, *[""] * len(scores)))

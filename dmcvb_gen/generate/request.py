@@ -27,6 +27,7 @@ from dmcvb_gen.spec import (
     is_maze,
     task_folder,
 )
+from dmcvb_gen.tasks import typed_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.text import as_names
 
@@ -55,8 +56,7 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
         from dmcvb_gen.distractors.registry import typed_setting  # which needs MuJoCo
 
         given["distractors"] = tuple(map(typed_setting, given["distractors"]))
-    tasks = tuple(task_id_of(task) for task in tasks)
-    allow(tasks)  # a person typed these names, so their code may run
+    tasks = tuple(map(typed_task, tasks))
     if not tasks and not recipe:
         raise RecipeError("give TASKs or --recipe; `dmcvb-gen list` shows the tasks and recipes")
     settings, fixed_goals = _settings(given)
@@ -81,20 +81,6 @@ def make_request(tasks: Sequence[str] = (), recipe: str | Path | None = None, **
     if given.get("sample") and is_own(str(given.get("behaviour") or "")):
         raise RecipeError("--sample has no effect: a function of your own draws by itself; remove it")
     return made
-
-
-def task_id_of(given: str | Path) -> str:
-    """A task's id; of a maze in a text file ("ring.txt"), the id that holds its rows.
-
-    Raises:
-      DmcvbError: the file cannot be read, or is no maze.
-    """
-    path = Path(given).expanduser()
-    if not (path.suffix == ".txt" or path.is_file()):
-        return str(given)
-    from dmcvb_gen.tasks.ant_maze import layout_task_id
-
-    return layout_task_id(path)
 
 
 def background_source(given: str | Path) -> str:

@@ -300,7 +300,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
         layers=("none-yet",),
         size=recipe.size,
         deterministic=request.deterministic,
-        policies=tuple(_policy_record(path, task, request.level) for path in files),
+        policies=tuple(_policy_record(path, task, request) for path in files),
         renderer={"name": recipe.renderer.backend, "samples": recipe.renderer.samples},
         family=task.family,
         views=tuple(task.views),
@@ -328,10 +328,10 @@ def _tell_of_held_actions(recipe: Recipe, subsets: Iterable[SubsetRecord]) -> No
             )
 
 
-def _policy_record(path: Path, task: Task, level: str) -> PolicyRecord:
-    policy = load_policy(path, task)
-    if policy.header.level not in (None, level):
-        raise RecipeError(f"{path} is a policy of level {policy.header.level}, not {level}; ask for that --level")
+def _policy_record(path: Path, task: Task, asked: SubsetRequest) -> PolicyRecord:
+    policy = load_policy(path, task, sample=not asked.deterministic)
+    if policy.header.level not in (None, asked.level):
+        raise RecipeError(f"{path} is a policy of level {policy.header.level}, not {asked.level}; ask for that --level")
     header = policy.header.model_dump(mode="json")
     header["training"].pop("curve", None)  # long, and in the policy's file
     if policy.header.algorithm == OWN_CODE:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from annotated_types import Ge
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.options import Location, Names, Seed, checked
+from dmcvb_gen.options import Location, Names, Seed, checked, refuse
 from dmcvb_gen.spec import Level
 from dmcvb_gen.text import as_names
 
@@ -25,7 +25,7 @@ def evaluate_behaviour(
     """Measure the returns of behaviour policies over fresh episodes, beside the paper's.
 
     Args:
-      tasks (TASK): Tasks; by default those of the policies.
+      tasks (TASK): Tasks, or text files of mazes; by default those of the policies.
       levels: expert, medium, mixed, random. [default: all bundled]
       behaviour (BEHAVIOUR): What to evaluate instead of the bundled policies, as in rollout.
       episodes: Fresh episodes of each policy.
@@ -43,21 +43,23 @@ def evaluate_behaviour(
     from dmcvb_gen.generate.info import return_statistics  # here, so that --help is quick
     from dmcvb_gen.generate.request import behaviour_source
     from dmcvb_gen.own_code import is_own
+    from dmcvb_gen.policies.archives import bundled_digests
     from dmcvb_gen.policies.bundled import bundled_levels
     from dmcvb_gen.policies.evaluation import maze_scores
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.policies.simulate import simulate
-    from dmcvb_gen.tasks import get_task, task_ids
+    from dmcvb_gen.tasks import get_task, typed_task
 
-    behaviour = behaviour_source(behaviour)
+    behaviour, typed = behaviour_source(behaviour), tuple(map(typed_task, as_names(tasks)))
     _check_levels(as_names(levels), behaviour, sample)
-    chosen, asked = _of_behaviour(behaviour, as_names(tasks), as_names(levels)) if behaviour else (tasks, levels)
-    chosen = as_names(chosen) or tuple(task_id for task_id in task_ids() if bundled_levels(task_id))
+    refuse("a function of your own draws by itself", sample=sample and is_own(behaviour or ""))
+    chosen, asked = _of_behaviour(behaviour, typed, as_names(levels)) if behaviour else (typed, as_names(levels))
+    chosen = chosen or tuple(dict.fromkeys(name.split("/")[0] for name in bundled_digests()))
     rows = []
     for task_id in chosen:
         task = get_task(task_id)
-        for level in as_names(asked) or (*bundled_levels(task_id), "random"):
-            policies = _policies(task_id, level, behaviour)
+        for level in asked or (*bundled_levels(task_id), "random"):
+            policies = _policies(task, level, behaviour, sample)
             out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
             row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
             own = is_own(behaviour or "") and level != "random"
@@ -93,17 +95,15 @@ def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -
         return tasks, levels or ["expert"]
     levels = levels or levels_of(behaviour)
     named = [level for level in levels if level != "random"]
-    files = [path for level in named for path in resolve_policies("", level, behaviour)]
+    files = [path for level in named for path in resolve_policies(next(iter(tasks), ""), level, behaviour)]
     return tasks or sorted({read_header(path).task for path in files}), levels
 
 
-def _policies(task_id: str, level: str, behaviour: str | None) -> list[Any]:
+def _policies(task: Any, level: str, behaviour: str | None, sample: bool) -> list[Any]:
     from dmcvb_gen.policies.actor import random_policy
     from dmcvb_gen.policies.bundled import resolve_policies
     from dmcvb_gen.policies.policy_file import load_policy
-    from dmcvb_gen.tasks import get_task
 
-    task = get_task(task_id)
     if level == "random":
         return [random_policy(task)]
-    return [load_policy(path, task) for path in resolve_policies(task_id, level, behaviour)]
+    return [load_policy(path, task, sample) for path in resolve_policies(task.id, level, behaviour)]

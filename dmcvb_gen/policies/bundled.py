@@ -10,9 +10,9 @@ from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
-from dmcvb_gen.own_code import is_own
+from dmcvb_gen.own_code import is_own, leave_of
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file
-from dmcvb_gen.spec import TRAINED_LEVELS, MazeName, task_folder
+from dmcvb_gen.spec import TRAINED_LEVELS, MazeName, is_maze, task_folder
 from dmcvb_gen.text import quoted
 
 CONVERTED = (".zip", ".pt", ".pth", ".cleanrl_model")
@@ -51,16 +51,16 @@ def bundled_policies(task_id: str, level: str) -> list[Path]:
     Raises:
       DmcvbError: the package has none (says how to get one), or no folder to unpack them into can be written.
     """
-    names = bundled_names(task_id, level)
+    names, maze = bundled_names(task_id, level), MazeName.parse(task_id)
     if not names:
         have = ", ".join([*bundled_levels(task_id), "random"])
-        maze = MazeName.parse(task_id)
-        own = maze is not None and maze.rows is not None
-        asked = "--layout FILE" if own else task_id + (" --algo guided" if maze else "")
+        train, run = f"dmcvb-gen train-behaviour {quoted(task_id)}", quoted(f"runs/{task_id}")
+        train += f"{' --algo guided' * bool(maze)} && {leave_of(task_id)}dmcvb-gen select-checkpoints {run}"
+        if maze and maze.rows:
+            train, run = f"dmcvb-gen train-behaviour {maze.layout}.txt", f"runs/{maze.layout}"
         raise DmcvbError(
-            f"no {level} policy of {task_folder(task_id)} is bundled (there is: {have}); "
-            f"train one with `dmcvb-gen train-behaviour {asked}` and "
-            "`dmcvb-gen select-checkpoints`, then give its run folder with --behaviour"
+            f"no {level} policy of {task_folder(task_id)} is bundled (there is: {have}); train one with `{train}`, "
+            f"then give --behaviour {run}"
         )
     return [bundled_file(name) for name in names]
 
@@ -125,6 +125,8 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
     Raises:
       DmcvbError: there is nothing for that level.
     """
+    if level == "mixed" and is_maze(task_id):
+        raise DmcvbError("mazes have no mixed policies, as in the paper; ask for expert or medium")
     if behaviour is None:
         return bundled_policies(task_id, level)
     path = checkpoint_of(behaviour) or Path(behaviour)

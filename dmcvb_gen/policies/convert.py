@@ -39,6 +39,7 @@ from dmcvb_gen.policies.sb3_zip import Facts, facts_of, read_members
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.text import quoted
 
 UNCLIPPED = 1e30
 """Stands for "not clipped" in a policy file's header."""
@@ -129,7 +130,7 @@ def convert(
         that are not finite; or an option has no effect.
     """
     path, task = Path(path), get_task(task_id)
-    command = f"dmcvb-gen convert-policy {path} {task_id} --out NEW.safetensors"
+    command = f"dmcvb-gen convert-policy {quoted(path)} {quoted(task_id)} --out NEW.safetensors"
     state, data = _read(path)
     facts = None if data is None else facts_of(path, data)
     layout, body, mean = _layout(path, state)

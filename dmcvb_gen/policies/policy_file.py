@@ -20,9 +20,13 @@ from dmcvb_gen.files import parse_json, write_bytes
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
-from dmcvb_gen.spec import is_maze
+from dmcvb_gen.spec import is_maze, task_folder
 from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.ant_maze import as_maze
 from dmcvb_gen.tasks.base import Task
+
+LEAST_NOISE = 1e-9
+"""Standard deviation below which drawn actions are the mean ones. Squashed Gaussians have exp(-20) = 2e-9 at least."""
 
 
 def save_policy(path: str | Path, header: PolicyHeader, weights: Mapping[str, np.ndarray]) -> None:
@@ -64,15 +68,16 @@ def _read(path: Path) -> tuple[PolicyHeader, dict[str, np.ndarray], str]:
     return header, weights, hashlib.sha256(data).hexdigest()
 
 
-def load_policy(path: str | Path, task: Task | None = None) -> Policy:
+def load_policy(path: str | Path, task: Task | None = None, sample: bool = False) -> Policy:
     """Load a policy file.
 
     Args:
       path: a policy file, or "<module>:<function>" (see `policies.own`), which needs a task.
       task: the task it must be for; the header's own by default.
+      sample: its actions will be drawn.
 
     Raises:
-      PolicyFileError: the file is not whole, is for another task, or its shapes or values do not fit.
+      PolicyFileError: the file is not whole, is for another task, its shapes or values do not fit, or it has no noise.
     """
     if is_own(str(path)) and task is not None:
         from dmcvb_gen.policies.own import own_policy
@@ -80,9 +85,11 @@ def load_policy(path: str | Path, task: Task | None = None) -> Policy:
         return own_policy(str(path), task)
     path = Path(path)
     header, weights, digest = _read(path)
-    if task is not None and header.task != task.id and not _same_family(header.task, task.id):
+    if task is not None and header.task != task.id and not (is_maze(header.task) and is_maze(task.id)):
         raise PolicyFileError(f"{path} is a policy for {header.task}, not for {task.id}; give one trained on {task.id}")
-    task = task or get_task(header.task)
+    task = task or get_task(header.task)  # ant-maze policies never see the layout, so most may act in any maze
+    if header.way is not None and as_maze(get_task(header.task)).layout.rows != as_maze(task).layout.rows:
+        raise PolicyFileError(f"{path} knows the way of another layout; give one trained on {task_folder(task.id)}")
     asked = (task.behaviour_size, task.action_size)
     if (header.observation_size, header.action_size) != asked:
         raise PolicyFileError(
@@ -94,7 +101,10 @@ def load_policy(path: str | Path, task: Task | None = None) -> Policy:
             f"{path} sees {header.observation!r}, {task.id} shows {task.observation!r}; train it again for this task"
         )
     check_weights(path, header, weights)
-    return Policy(header, weights, digest)
+    policy = Policy(header, weights, digest)
+    if sample and policy.distribution(np.zeros((1, task.behaviour_size)))[1].max() < LEAST_NOISE:
+        raise PolicyFileError(f"--sample has no effect: a policy for {task.id} has no noise to sample; remove it")
+    return policy
 
 
 def check_weights(path: Path, header: PolicyHeader, weights: Mapping[str, np.ndarray]) -> None:
@@ -118,8 +128,3 @@ def check_weights(path: Path, header: PolicyHeader, weights: Mapping[str, np.nda
             )
     if not (weights["observation_std"] > 0).all():
         raise PolicyFileError(f"{path}: observation_std is not positive; give 1 to observations that never change")
-
-
-def _same_family(first: str, second: str) -> bool:
-    """Ant-maze policies never see the layout, so one may be used (and warm-started) in another maze."""
-    return is_maze(first) and is_maze(second)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
-from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.own_code import is_own
-from dmcvb_gen.spec import is_maze
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.own_code import allow, is_own
+from dmcvb_gen.spec import MazeName, is_maze
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, ant_maze_task
+from dmcvb_gen.tasks.ant_maze.layouts import load_layout
 from dmcvb_gen.tasks.base import ACTION_REPEAT, ACTION_REPEATS, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
 from dmcvb_gen.tasks.own import own_task
@@ -27,6 +29,22 @@ LOCOMOTION_TASKS = tuple(REGISTRY)
 def task_ids() -> tuple[str, ...]:
     """The names of the tasks that are written for a batch, mazes included."""
     return LOCOMOTION_TASKS + ANT_MAZE_TASKS
+
+
+def typed_task(given: str | Path | None) -> str:
+    """The id of a task that a person typed, whose code may run; of a maze's text file, the id that holds its rows.
+
+    Raises:
+      DmcvbError: nothing was typed, or the file cannot be read, or is no maze.
+    """
+    if given is None:
+        raise DmcvbError("give a TASK, or the text file of a maze")
+    path = Path(given).expanduser()
+    if path.suffix == ".txt" or path.is_file():
+        layout = load_layout(path)
+        return str(MazeName(layout.name, layout.text))
+    allow([str(given)])
+    return str(given)
 
 
 @functools.cache
@@ -60,4 +78,5 @@ __all__ = [
     "get_task",
     "suite_ids",
     "task_ids",
+    "typed_task",
 ]

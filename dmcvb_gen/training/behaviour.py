@@ -63,9 +63,8 @@ def _one_thread() -> Iterator[None]:
 @_one_thread()
 @checked
 def train_behaviour(
-    task: str | None = None,
+    task: Location | None = None,
     *,
-    layout: Location | None = None,
     out: Local | None = None,
     steps: Count | None = None,
     seed: Seed | None = None,
@@ -80,13 +79,11 @@ def train_behaviour(
     """Train a behaviour policy online on states.
 
     Args:
-      task (TASK): Task to learn.
-      layout (FILE): Text file of a maze of your own, instead of TASK: learns to walk it (guided) and selects
-        checkpoints.
-      out: Folder of the run. [default: runs/TASK; with --layout: runs/LAYOUT]
+      task (TASK): Task to learn; of a maze of your own its text file, then checkpoints are selected, too.
+      out: Folder of the run. [default: runs/TASK, runs/ring for ring.txt]
       steps: Agent steps (at action repeat 2). [default: the task's]
       seed: Random seed. [default: 0]
-      algo: sac, mpo, guided (mazes), or any of SB3 and sb3-contrib, e.g. sb3:TQC. [default: sac; --layout: guided]
+      algo: sac, mpo, guided (mazes), or sb3:A2C, DDPG, PPO, SAC, TD3, TQC, TRPO. [default: sac; a maze's file: guided]
       settings (KEY=VALUE): Override a setting, e.g. learning_rate=0.0003.
       init_from (RUN|FILE): Run or policy file to start from; guided: the policy that walks.
       evaluate_every: Agent steps between evaluations, and so between checkpoints. [default: the task's]
@@ -103,24 +100,24 @@ def train_behaviour(
     from dmcvb_gen.precision import choose_precision
     from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.storage.places import local_path
+    from dmcvb_gen.tasks import typed_task
     from dmcvb_gen.training.run import open_run, read_config
     from dmcvb_gen.training.selection import plot_curve, select_checkpoints
     from dmcvb_gen.training.settings import parse_settings
 
     found = read_config(out) if resume and out else None
-    task = found.task if found and not (task or layout) else task_of(task, layout)
-    maze = MazeName.parse(task)
-    own_maze = bool(maze and maze.rows)
-    folder = local_path(out or Path("runs") / (maze.layout if maze and own_maze else task))
+    task_id = found.task if found and not task else typed_task(task)
+    maze = own_maze(task_id)
+    folder = local_path(out or Path("runs") / (maze.layout if maze else task_id))
     found = read_config(folder) if resume else None
     if resume and found is None:
         raise DmcvbError(f"{folder} holds no run to resume; give its folder with --out, or remove --resume")
-    algorithm = algo or (found.algorithm if found else "guided" if own_maze else "sac")
+    algorithm = algo or (found.algorithm if found else "guided" if maze else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from and str(init_from))
     asked = parse_settings(as_names(settings), algorithm)
     if algorithm == "sac" and not found:
         asked = {"bfloat16": choose_precision("auto") == "bfloat16"} | asked
-    run = open_run(folder, run_config(task, algorithm, asked, found, **given), resume)  # type: ignore[arg-type]
+    run = open_run(folder, run_config(task_id, algorithm, asked, found, **given), resume)  # type: ignore[arg-type]
     saved = run.saved()
     done, total = saved["step"] if saved else 0, run.config.steps
     if found and total < min(done, found.steps):  # a finished run is a few steps past its own number
@@ -128,9 +125,9 @@ def train_behaviour(
     for line in plan_of(run, done):
         notify(line)
     _train(run, done, progress, notify)
-    expert = paper_returns(task, "expert")
+    expert = paper_returns(task_id, "expert")
     curve, picked = plot_curve(folder, expert and expert["mean"]), None
-    if own_maze:
+    if maze:
         with ProgressBar(progress, unit=" checkpoints", desc="selection") as bar:
             picked = select_checkpoints(folder, progress=bar)
     return TrainedRun(folder, curve, run.step, run.seconds, picked)
@@ -157,20 +154,10 @@ def run_config(
     return RunConfig(task=task_id, algorithm=algorithm, **defaults | {"settings": defaults["settings"] | settings})
 
 
-def task_of(task: str | None, layout: str | Path | None) -> str:
-    """The id of the task that a person asked for, whose code may run from now on.
-
-    Raises:
-      DmcvbError: a task and a maze are given, or neither.
-    """
-    from dmcvb_gen.own_code import allow
-    from dmcvb_gen.tasks.ant_maze import layout_task_id
-
-    if (task is None) == (layout is None):
-        raise DmcvbError("give a TASK, or the file of a maze with --layout")
-    task = task or layout_task_id(layout or "")
-    allow([task])  # a person typed its name
-    return task
+def own_maze(task_id: str) -> MazeName | None:
+    """The name of a maze of one's own; None of other tasks."""
+    maze = MazeName.parse(task_id)
+    return maze if maze and maze.rows else None
 
 
 def plan_of(run: "Run", done: int = 0) -> list[str]:

@@ -24,7 +24,7 @@ from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import MAX_LAYERS, WAY_SIZE, Width
 from dmcvb_gen.policies.open_maze import places
-from dmcvb_gen.policies.policy_file import load_policy
+from dmcvb_gen.policies.policy_file import load_policy, read_header
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, Layout
 from dmcvb_gen.tasks.ant_maze.task import GOAL_NOISE
@@ -182,7 +182,8 @@ def base_policy(run: Run) -> Policy:
     """
     if not is_maze(run.task.id):
         raise DmcvbError(f"--algo guided is for ant mazes, there is no way to a goal in {run.task.id}")
-    return load_policy(_base_file(run), run.task)
+    path = _base_file(run)
+    return load_policy(path, None if is_maze(read_header(path).task) else run.task)  # whatever way it knows goes
 
 
 def _base_file(run: Run) -> Path:

@@ -1,4 +1,4 @@
-"""Train with any algorithm of Stable-Baselines3 or sb3-contrib, "sb3:NAME", into a run's folder of policy files.
+"""Train with an algorithm of Stable-Baselines3 or sb3-contrib, "sb3:NAME", into a run's folder of policy files.
 
 Settings are the arguments of the algorithm's class. Policies are exported as everybody's zips are, by
 `policies.convert`. A run goes on from SB3's own parameters and its replay buffer, with new episodes; nothing is
@@ -23,16 +23,22 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
-from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, PolicyFileError, UnknownNameError
 from dmcvb_gen.policies.convert import UNCLIPPED, convert
 from dmcvb_gen.training.networks import as_tensors
 from dmcvb_gen.training.run import Run
-from dmcvb_gen.training.settings import SB3
+from dmcvb_gen.training.settings import SB3, Count, Natural, NonNegative
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
+ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3", "TQC", "TRPO")
+"""Those whose actors for continuous actions are plain MLPs, which policy files hold."""
 NOT_SET = ("self", "policy", "env", "device", "verbose", "seed", "tensorboard_log", "_init_setup_model")
 """Arguments of an algorithm that the run gives."""
 OURS = {"simulations": 8, "normalize_observation": False, "normalize_reward": False}
+KINDS: dict[Any, Any] = {bool: bool, int: Count, float: NonNegative, str: float | str}
+KINDS |= {"gradient_steps": int, "learning_starts": Natural, "top_quantiles_to_drop_per_net": Natural}
+KINDS |= dict.fromkeys(("action_noise", "clip_range_vf", "target_kl"), NonNegative | None)
+"""Argument, or the type of its default -> what it may be."""
 MEANINGS = """Settings of an algorithm of SB3.
 
 Attributes:
@@ -46,14 +52,12 @@ def algorithm_class(algorithm: str) -> type[BaseAlgorithm]:
     """The class that "sb3:NAME" names.
 
     Raises:
-      UnknownNameError: neither package has it.
+      UnknownNameError: neither package has it, or its actors cannot be exported.
     """
     name = algorithm.removeprefix(SB3)
-    kind = getattr(sb3_contrib, name, None) or getattr(stable_baselines3, name, None)
-    if not (isinstance(kind, type) and issubclass(kind, BaseAlgorithm)):
-        known = [*stable_baselines3.__all__, *sb3_contrib.__all__]
-        raise UnknownNameError("algorithm of Stable-Baselines3", name, known)
-    return kind
+    if name not in ALGORITHMS:
+        raise UnknownNameError("algorithm of Stable-Baselines3 with plain MLP actors", name, ALGORITHMS)
+    return getattr(sb3_contrib, name, None) or getattr(stable_baselines3, name)
 
 
 def settings_class(algorithm: str) -> type:
@@ -62,7 +66,7 @@ def settings_class(algorithm: str) -> type:
     given = inspect.signature(kind).parameters
     defaults = {name: value.default for name, value in given.items() if name not in NOT_SET}
     values = OURS | defaults
-    fields = [(name, Any, dataclasses.field(default=value)) for name, value in values.items()]
+    fields = [(n, KINDS.get(n) or KINDS.get(type(v), Any), dataclasses.field(default=v)) for n, v in values.items()]
     lines = re.findall(r":param (\w+): (.+(?:\n(?!\s*:).+)*)", kind.__doc__ or "")
     documented = {name: " ".join(text.split()).rstrip(".") for name, text in lines}
     meanings = "".join(f"  {name}: {documented.get(name, 'see Stable-Baselines3')}.\n" for name in defaults)
@@ -110,7 +114,7 @@ def make_model(run: Run) -> BaseAlgorithm:
         env = VecNormalize(env, **norms)
     try:
         model = algorithm_class(run.config.algorithm)("MlpPolicy", env, seed=seed, device="cpu", **given)
-    except (ValueError, TypeError, AssertionError) as error:
+    except Exception as error:  # SB3's, torch's and numpy's own kinds
         reason = " ".join(str(error).split())
         raise DmcvbError(f"{run.config.algorithm} does not accept this: {reason}; change it with --set") from None
     model.set_logger(Logger(None, []))  # its own makes a folder in the system's temporary folder each time
@@ -126,7 +130,10 @@ def export(run: Run, model: BaseAlgorithm) -> tuple[dict[str, torch.Tensor], dic
     with tempfile.TemporaryDirectory() as folder:
         np.savez(Path(folder, "seen.npz"), mean=mean, std=std)
         model.save(Path(folder, "model.zip"))
-        header, weights = convert(Path(folder, "model.zip"), run.task.id, statistics=Path(folder, "seen.npz"))
+        try:
+            header, weights = convert(Path(folder, "model.zip"), run.task.id, statistics=Path(folder, "seen.npz"))
+        except PolicyFileError as error:
+            raise PolicyFileError(str(error).replace(f"{folder}/model.zip", run.config.algorithm)) from None
     built = {name: getattr(header, name) for name in ("hidden", "activation", "distribution")}
     return as_tensors(weights), built | {"clip_observation": 10.0 if normalize and normalize.norm_obs else UNCLIPPED}
 

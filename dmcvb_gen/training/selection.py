@@ -177,6 +177,9 @@ def read_curve(folder: str | Path) -> list[Point]:
     """Every evaluation of a run, in order of steps, as the checkpoints' headers have them.
 
     A checkpoint that is being written while we look is left out, and one where the run was stopped, too.
+
+    Raises:
+      DmcvbError: there is none.
     """
     curve: list[Point] = []
     for path in sorted((Path(folder) / "checkpoints").glob("*.safetensors")):
@@ -184,6 +187,8 @@ def read_curve(folder: str | Path) -> list[Point]:
             header = read_header(path)
             if header.evaluation is not None:
                 curve.append((header.agent_step, header.evaluation.mean, path))
+    if not curve:
+        raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour that has some")
     return sorted(curve)
 
 
@@ -292,8 +297,6 @@ def select_checkpoints(folder: str | Path, episodes: int = 100, progress: Progre
     """
     folder = Path(folder)
     curve = read_curve(folder)
-    if not curve:
-        raise DmcvbError(f"{folder} holds no evaluated checkpoints; give a run folder of train-behaviour")
     task = get_task(read_header(curve[0][2]).task)
     base = _base(task, episodes)
     measured: dict[str, Policy] = {}

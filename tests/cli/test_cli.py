@@ -202,7 +202,7 @@ def test_listed_values_are_the_tasks_and_those_given(tmp_path):
     assert (walker["learning_rate"]["value"], walker["simulations"]["value"]) == (0.001, 8)
     assert (maze["simulations"]["value"], maze["critics"]["value"]) == (16, 3)
     (tmp_path / "ring.txt").write_text("****\n*  *\n****\n")  # a maze of one's own is learned by `guided`
-    assert "half_life=12500" in said("train-behaviour", "--layout", tmp_path / "ring.txt", "--list-settings")
+    assert "half_life=12500" in said("train-behaviour", tmp_path / "ring.txt", "--list-settings")
 
 
 READ = """

@@ -440,8 +440,16 @@ def test_files_that_make_no_policy_are_refused_and_change_no_file(plain, name, s
 
 
 def test_a_plain_network_says_neither_activation_nor_actions(plain, tmp_path):
-    refusal = refused("rollout", WALKER, *TINY, "--behaviour", plain[1], "--out", tmp_path / "r")
-    assert f"run `dmcvb-gen convert-policy {plain[1]} {WALKER} --out NEW.safetensors --activation" in refusal
+    path = plain[1].rename(tmp_path / "a b.pt")
+    refusal = refused("rollout", WALKER, *TINY, "--behaviour", path, "--out", tmp_path / "r")
+    assert f"run `dmcvb-gen convert-policy '{path}' {WALKER} --out NEW.safetensors --activation" in refusal
+
+
+def test_a_policy_without_noise_is_not_sampled(plain, tmp_path):
+    run(*plain, "--actions", "clip", "--out", tmp_path / "clip.safetensors")
+    for name, *command in (("p", "rollout", "--out", tmp_path / "r"), ("clip", "evaluate-behaviour")):
+        words = ["--sample", "--behaviour", tmp_path / f"{name}.safetensors"]
+        assert "has no noise to sample; remove it" in refused(*command, WALKER, *words)
 
 
 @pytest.mark.parametrize(

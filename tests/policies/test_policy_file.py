@@ -192,7 +192,7 @@ def test_a_truncated_file_is_refused(policy_path, keep):
 
 
 def test_a_missing_level_says_how_to_get_it(tmp_path):
-    with pytest.raises(DmcvbError, match="train-behaviour"):
+    with pytest.raises(DmcvbError, match="select-checkpoints runs/walker-walk`, then give --behaviour runs"):
         bundled_policies("walker-walk", "grandmaster")
     with pytest.raises(PolicyFileError, match="select-checkpoints"):
         resolve_policies("walker-walk", "expert", tmp_path)

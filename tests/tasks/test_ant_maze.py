@@ -14,8 +14,8 @@ from labmaze import assets
 from scipy import ndimage, sparse
 
 from dmcvb_gen.errors import LayoutError
-from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, LAYOUTS, fixed_pairs, layout_task_id
+from dmcvb_gen.tasks import get_task, typed_task
+from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, LAYOUTS, fixed_pairs
 from dmcvb_gen.tasks.ant_maze.arena import WALL_HEIGHT
 from dmcvb_gen.tasks.ant_maze.distance import (
     PIXELS,
@@ -312,7 +312,7 @@ def test_bad_layouts(text, message):
 def test_own_layout(tmp_path):
     path = tmp_path / "my maze.txt"
     path.write_text("******\n*    *\n* ** *\n*    *\n******\n\n")
-    task = get_task(layout_task_id(path))
+    task = get_task(typed_task(path))
     assert task.id.startswith("ant-maze-my_maze:") and task.layout.shape == (5, 6)
     state = task.batch(1).reset([np.random.default_rng(0)])
     assert state.shape == (1, 167)

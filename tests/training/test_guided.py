@@ -13,6 +13,7 @@ import torch
 
 import dmcvb_gen
 from dmcvb_gen.policies.actor import Policy
+from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.open_maze import open_maze_observation, places
 from dmcvb_gen.policies.policy_file import load_policy, read_header
 from dmcvb_gen.tasks import get_task
@@ -67,7 +68,9 @@ def test_headed_is_what_an_ant_in_the_middle_of_an_open_maze_sees():
 
 
 def test_the_actor_and_the_network_that_learns_agree(tmp_path):
-    run = open_run(tmp_path / "run", config(settings={"simulations": 6}), False)
+    """The policy that walks may know another maze's way, which goes."""
+    walker = str(bundled_policies("ant-maze-medium7x7a", "expert")[0])
+    run = open_run(tmp_path / "run", config(settings={"simulations": 6}, init_from=walker), False)
     base = base_policy(run)
     student = Student(run, base)
     policy = Policy(run.header, as_arrays(student.weights()), "")
@@ -75,7 +78,7 @@ def test_the_actor_and_the_network_that_learns_agree(tmp_path):
     with torch.no_grad():
         learned = student.way(torch.from_numpy(places(seen))).numpy()
     np.testing.assert_allclose(policy.predict_waypoint(seen), learned, atol=1e-5)
-    plain = Policy(base.header, base.weights, "")
+    plain = Policy(base.header.model_copy(update={"way": None}), base.weights, "")
     wanted = plain.act(open_maze_observation(seen, policy.predict_waypoint(seen)), deterministic=True)
     np.testing.assert_array_equal(policy.act(seen, deterministic=True), wanted)
     assert (student.act(seen) == wanted).all(axis=1).tolist() == [True] * 3 + [False] * 3, "half act by their mean"
@@ -130,9 +133,7 @@ def in_folder(tmp_path, monkeypatch):
 def documented_commands() -> list[list[str]]:
     """The commands of docs/mazes.md that make a release of ring.txt."""
     page = (Path(__file__).parents[2] / "docs" / "mazes.md").read_text()
-    block = next(
-        code for code in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if "train-behaviour --layout" in code
-    )
+    block = next(code for code in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if "train-behaviour ring" in code)
     return [shlex.split(line)[1:] for line in block.splitlines()]
 
 
@@ -169,13 +170,6 @@ def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, 
 )
 def test_a_maze_that_cannot_be_learned_is_one_line(in_folder, rows, message):
     (in_folder / "bad.txt").write_text(rows)
-    done = invoke("train-behaviour", "--layout", "bad.txt", code=2)
+    done = invoke("train-behaviour", "bad.txt", code=2)
     assert re.search(message, done.output) and done.output.count("\n") == 1
     assert not os.path.exists("runs")
-
-
-def test_a_task_and_a_layout_are_one_too_many(in_folder):
-    (in_folder / "hall.txt").write_text(HALL)
-    for arguments in ([], ["walker-walk", "--layout", "hall.txt"]):
-        done = invoke("train-behaviour", *arguments, code=2)
-        assert "give a TASK, or the file of a maze with --layout" in done.output

@@ -243,6 +243,9 @@ def test_a_finished_run_that_went_a_few_steps_too_far_resumes_to_what_it_is(tmp_
     assert before == {path.name: path.read_bytes() for path in (tmp_path / "run" / "checkpoints").iterdir()}
     with pytest.raises(DmcvbError, match="at step 92, past steps 60; give more"):
         train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=60, progress=False)
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    with pytest.raises(DmcvbError, match="holds no evaluated checkpoints; give a run folder"):
+        train_behaviour(out=tmp_path / "run", resume=True, progress=False)
 
 
 def test_training_leaves_the_callers_threads_and_figures_alone(tmp_path):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.spec import MazeName
-from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, fixed_pairs, get_layout, load_layout, make_layout
+from dmcvb_gen.tasks.ant_maze.layouts import LAYOUTS, fixed_pairs, get_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import AntMaze
 from dmcvb_gen.tasks.base import Task
 
@@ -38,16 +38,6 @@ def as_maze(task: Task) -> AntMaze:
     return task
 
 
-def layout_task_id(path) -> str:
-    """The task id that carries the layout of a text file.
-
-    Raises:
-      LayoutError: the file is no layout.
-    """
-    layout = load_layout(path)
-    return str(MazeName(layout.name, layout.text))
-
-
 __all__ = [
     "ANT_MAZE_TASKS",
     "LAYOUTS",
@@ -55,5 +45,4 @@ __all__ = [
     "ant_maze_task",
     "as_maze",
     "fixed_pairs",
-    "layout_task_id",
 ]
