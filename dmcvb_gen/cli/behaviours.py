@@ -146,7 +146,7 @@ def _converted(
 
     Args:
       source (SOURCE): The policy: a zip of Stable-Baselines3, or a torch state dict.
-      task (TASK): Task that it acts in.
+      task (TASK): Task that it acts in, or a maze's text file.
       out (FILE): Policy file to write (.safetensors).
       level: Level to note in the file.
       activation: Of hidden layers. [default: the program's]
