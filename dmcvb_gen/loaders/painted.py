@@ -36,8 +36,17 @@ DEFAULT_CACHE = 1_000_000_000
 """Bytes of painted episodes that a subset keeps."""
 DRAWN_TOGETHER = 32
 """Episodes whose fresh distractors are drawn at once: one episode's walks take as long as those of dozens."""
-DRAWN_KEPT = 16 * DRAWN_TOGETHER
-"""Episodes whose fresh distractors a subset keeps."""
+DRAWN_KEPT = 4 * DRAWN_TOGETHER
+"""Episodes of which a subset keeps what they are painted from."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What an episode's frames are painted from: (row, ...) states and labels, and its transitions."""
+
+    physics: np.ndarray
+    length: int
+    labels: DistractorState
 
 
 @dataclass(frozen=True)
@@ -80,7 +89,7 @@ class PaintedSubset(SubsetReader):
 
     def _start(self) -> None:
         self._kept: OrderedDict[tuple[int, int, str], np.ndarray] = OrderedDict()
-        self._drawn: OrderedDict[tuple[int, int], DistractorState] = OrderedDict()
+        self._drawn: OrderedDict[tuple[int, int], Drawn] = OrderedDict()
         self._painter: tuple[Renderer, Any] | None = None
         self._bytes, self._lock = 0, threading.Lock()
 
@@ -148,17 +157,17 @@ class PaintedSubset(SubsetReader):
         rows = int(self.read("length", [episode])[0]) + 1
         values = np.zeros((self.record.max_steps + 1, *spec.shape), spec.dtype)
         with self._lock:
-            values[:rows] = getattr(self._fresh_labels(episode), spec.name.removeprefix("exogenous/"))[:rows]
+            values[:rows] = getattr(self._drawn_of(episode).labels, spec.name.removeprefix("exogenous/"))[:rows]
         return values
 
     def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
-        """Draw fresh distractors of episodes together, as far as their pictures are not kept and there is room."""
+        """Read and draw what episodes are painted from together, as far as their pictures are not kept."""
         with self._lock:
             names, epoch = tuple(pictures), self.epoch
             missing = [int(e) for e in episodes if any((int(e), epoch, name) not in self._kept for name in names)]
-            if self.fresh and len(missing) <= DRAWN_KEPT:
+            if len(missing) <= DRAWN_KEPT:
                 for first in range(0, len(missing), DRAWN_TOGETHER):
-                    self._draw_labels(missing[first : first + DRAWN_TOGETHER])
+                    self._draw(missing[first : first + DRAWN_TOGETHER])
 
     def painted(self, episode: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Picture arrays of an episode by name, each (row, height, width, 3) uint8.
@@ -191,13 +200,10 @@ class PaintedSubset(SubsetReader):
 
     def _paint(self, episode: int, arrays: list[str]) -> dict[str, np.ndarray]:
         renderer, _ = self._open_painter()
-        index = [episode]
-        length = self.read("length", index)
-        used = int(length.max()) + 1
-        physics = self.read("physics", index)[:, :used]
-        labels = self._fresh_labels(episode)[None, :used] if self.fresh else self.labels(index)[:, :used]
-        task, rows = get_task(self.task), self.record.max_steps + 1
-        pictures = paint(task, renderer, physics, labels, length, rows, arrays=arrays)
+        drawn = self._drawn_of(episode)
+        length, rows = np.array([drawn.length]), self.record.max_steps + 1
+        physics, labels = drawn.physics[None, : drawn.length + 1], drawn.labels[None, : drawn.length + 1]
+        pictures = paint(get_task(self.task), renderer, physics, labels, length, rows, arrays=arrays)
         return {name: value[0] for name, value in pictures}
 
     def _open_painter(self) -> tuple[Renderer, Any]:
@@ -205,25 +211,34 @@ class PaintedSubset(SubsetReader):
             self._painter = renderer_for(self.record, self._videos())
         return self._painter
 
-    def _fresh_labels(self, episode: int) -> DistractorState:
-        """Labels of an episode's frames in this epoch; they are drawn with those of its neighbors."""
+    def _drawn_of(self, episode: int) -> Drawn:
+        """What an episode's frames are painted from in this epoch; fresh labels are drawn with those of neighbors."""
         if (episode, self.epoch) not in self._drawn:
-            first = int(np.argmax(self.episodes == episode)) // DRAWN_TOGETHER * DRAWN_TOGETHER
-            self._draw_labels(self.episodes[first : first + DRAWN_TOGETHER].tolist())
+            together = [episode]
+            if self.fresh:
+                first = int(np.argmax(self.episodes == episode)) // DRAWN_TOGETHER * DRAWN_TOGETHER
+                together = self.episodes[first : first + DRAWN_TOGETHER].tolist()
+            self._draw(together)
         return self._drawn[episode, self.epoch]
 
-    def _draw_labels(self, episodes: list[int]) -> None:
+    def _draw(self, episodes: list[int]) -> None:
         new = [episode for episode in episodes if (episode, self.epoch) not in self._drawn]
         if new:
-            names, (_, videos) = (*stream_names(self.trajectories), f"epoch {self.epoch}"), self._open_painter()
-            streams = (self.record, int(self.trajectories.makes["seed"]), names, np.array(new))
-            physics, length, action = (self.read(name, new) for name in ("physics", "length", "action"))
-            labels = distractor_state_of(*streams, physics, length, videos, action)
-            self._drawn |= {(episode, self.epoch): labels[place] for place, episode in enumerate(new)}
+            physics, length = self.read("physics", new), self.read("length", new)
+            labels = self._fresh_labels(new, physics, length) if self.fresh else self.labels(new)
+            self._drawn |= {
+                (episode, self.epoch): Drawn(physics[place], int(length[place]), labels[place])
+                for place, episode in enumerate(new)
+            }
         for episode in episodes:
             self._drawn.move_to_end((episode, self.epoch))
         while len(self._drawn) > DRAWN_KEPT:
             self._drawn.popitem(last=False)
+
+    def _fresh_labels(self, episodes: list[int], physics: np.ndarray, length: np.ndarray) -> DistractorState:
+        names, (_, videos) = (*stream_names(self.trajectories), f"epoch {self.epoch}"), self._open_painter()
+        streams = (self.record, int(self.trajectories.makes["seed"]), names, np.array(episodes))
+        return distractor_state_of(*streams, physics, length, videos, self.read("action", episodes))
 
     def _videos(self) -> str:
         given = self.painting.backgrounds
