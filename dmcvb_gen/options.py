@@ -11,8 +11,7 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar
 
@@ -131,13 +130,11 @@ def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:
     return [kind for kinds, _ in parts for kind in kinds], [mark for _, marks in parts for mark in marks]
 
 
-@contextmanager
-def progress_bar(shown: bool, unit: str, name: str | None = None, scaled: bool = True) -> Iterator[ProgressBar]:
+def progress_bar(shown: bool, unit: str, name: str | None = None, scaled: bool = True) -> ProgressBar:
     """A bar on standard error; drawn if `shown`."""
     from dmcvb_gen.progress import ProgressBar
 
-    with ProgressBar(shown, unit=unit, unit_scale=scaled, desc=name) as bar:
-        yield bar
+    return ProgressBar(shown, unit=unit, unit_scale=scaled, desc=name)
 
 
 def refuse(reason: str, **given: Any) -> None:

@@ -94,5 +94,5 @@ def fake_hub(root: Path, monkeypatch, repository: str = "me/tiny") -> FakeHub:
 
     hub.served = serving(give_files(hub.find))  # until the hub is forgotten
     hub.endpoint = hub.served.__enter__().url
-    monkeypatch.setattr("dmcvb_gen.storage.hugging_face.new_api", lambda *_: hub)
+    monkeypatch.setattr("huggingface_hub.HfApi", lambda **_: hub)
     return hub

@@ -165,7 +165,3 @@ def _stop_on_signals(context: click.Context) -> None:
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
         context.call_on_close(lambda: [signal.signal(number, handler) for number, handler in before.items()])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -26,12 +26,11 @@ def info(path, options, as_json):
     \b
     dmcvb-gen info releases/demo
     """
-    from dmcvb_gen.generate.info import describe_release
+    from dmcvb_gen.generate.info import STATISTICS, describe_release
 
     facts = describe_release(path, options)
     if as_json:
         return print_json(facts)
-    statistics = ("mean", "std", "min", "p25", "median", "p75", "max")
     rows = []
     for subset in facts["subsets"]:
         planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
@@ -42,12 +41,12 @@ def info(path, options, as_json):
                 f"{subset['episodes']:,}{planned}",
                 f"{subset['steps']:,}",
                 format_bytes(subset["bytes"]),
-                *(f"{subset['returns'][key]:.1f}" for key in statistics),
+                *(f"{subset['returns'][key]:.1f}" for key in STATISTICS),
                 "" if subset["normalized"] is None else f"{subset['normalized']:.0f}",
             )
         )
         if paper := subset["paper"]:
-            numbers = (f"{paper[key]:.1f}" for key in statistics)
+            numbers = (f"{paper[key]:.1f}" for key in STATISTICS)
             rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", *numbers, ""))
     title = f"{facts['name']} {facts['version']}"
     if facts["part"]:
@@ -55,7 +54,7 @@ def info(path, options, as_json):
     elif not facts["complete"]:
         title += " (not complete)"
     print_table(
-        ("subset", "episodes", "steps", "size", *statistics, "score"),
+        ("subset", "episodes", "steps", "size", *STATISTICS, "score"),
         rows,
         title=title,
         optional=(("p25", "p75"), ("min", "max"), ("score",), ("size",), ("median",)),

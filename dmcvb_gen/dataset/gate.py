@@ -31,6 +31,7 @@ from dmcvb_gen.dataset.manifest import (
     LayerList,
     ListedLayer,
     Manifest,
+    Parsed,
     Resolved,
     ShardRecord,
     SubsetRecord,
@@ -239,11 +240,8 @@ class Release:
         return self._records[layer]
 
     def _read_list(self, layer: ListedLayer) -> dict[int, ShardRecord]:
-        path, where = list_path(layer.list), f"{self.place}/{list_path(layer.list)}"
-        text = self.store.read(path, list_bytes_limit(layer))
-        if sha256_bytes(text) != layer.list:
-            raise StoreError(f"{where} was altered: it does not have its own SHA-256; fetch it again")
-        shards = parse(LayerList, text, where).shards
+        where = f"{self.place}/{list_path(layer.list)}"
+        shards = _read_named(self.store, list_path(layer.list), layer.list, list_bytes_limit(layer), LayerList).shards
         if len(shards) != layer.shards:
             raise StoreError(f"{where} lists {len(shards)} shards, and the manifest says {layer.shards}")
         return {number: check_record(record, layer, number, where) for number, record in enumerate(shards)}
@@ -414,11 +412,15 @@ def read_recipe(store: Store, digest: str) -> Resolved:
     Raises:
       StoreError: it is missing or was altered.
     """
-    path = f"{RECIPES}{digest}.json"
-    text = store.read(path, RECIPE_BYTES)
+    return _read_named(store, f"{RECIPES}{digest}.json", digest, RECIPE_BYTES, Resolved)
+
+
+def _read_named(store: Store, path: str, digest: str, limit: int, model: type[Parsed]) -> Parsed:
+    """A file whose name is its own SHA-256. Raises StoreError if it is missing or was altered."""
+    text = store.read(path, limit)
     if sha256_bytes(text) != digest:
         raise StoreError(f"{store.place}/{path} was altered: it does not have its own SHA-256; fetch it again")
-    return parse(Resolved, text, f"{store.place}/{path}")
+    return parse(model, text, f"{store.place}/{path}")
 
 
 def read_recipes(store: Store) -> list[Resolved]:
@@ -454,13 +456,17 @@ def read_records(store: Store, layer: Layer, known: Mapping[int, ShardRecord] | 
     """
     found = dict(known or {})
     new = sorted(recorded_shards(store, layer.name) - found.keys())
-
-    def read(number: int) -> ShardRecord:
-        path = record_path(layer.name, number)
-        where = f"{store.place}/{path}"
-        record = parse(ShardRecord, store.read(path, record_bytes_limit(layer)), where)
-        return check_record(record, layer, number, where)
-
     with ThreadPoolExecutor(READERS) as pool:
-        found |= dict(zip(new, pool.map(read, new), strict=True))
+        found |= dict(zip(new, pool.map(functools.partial(read_record, store, layer), new), strict=True))
     return dict(sorted(found.items()))
+
+
+def read_record(store: Store, layer: Layer, shard: int) -> ShardRecord:
+    """The record of a layer's shard.
+
+    Raises:
+      StoreError: it is missing, damaged, or of another job.
+    """
+    path = record_path(layer.name, shard)
+    record = parse(ShardRecord, store.read(path, record_bytes_limit(layer)), f"{store.place}/{path}")
+    return check_record(record, layer, shard, f"{store.place}/{path}")

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset.environment import environment
-from dmcvb_gen.dataset.gate import READERS, Release, Shard, read_recipes, read_records
+from dmcvb_gen.dataset.gate import READERS, Release, Shard, read_recipes, read_record, read_records
 from dmcvb_gen.dataset.manifest import (
     COPY,
     MANIFEST,
@@ -43,12 +43,9 @@ from dmcvb_gen.dataset.manifest import (
     SubsetRecord,
     build_manifest,
     canonical_json,
-    check_record,
     list_path,
     merged_layers,
     merged_subsets,
-    parse,
-    record_bytes_limit,
     record_path,
     runs,
 )
@@ -171,12 +168,11 @@ def put_record(store: Store, layer: Layer, shard: int, record: ShardRecord) -> S
     path = record_path(layer.name, shard)
     if store.create(path, canonical_json(record)):
         return record
-    where = f"{store.place}/{path}"
-    there = check_record(parse(ShardRecord, store.read(path, record_bytes_limit(layer)), where), layer, shard, where)
+    there = read_record(store, layer, shard)
     if there != record:
         raise StoreError(
-            f"{where} names other files (made by {makers(store)}) than {_versions(environment())} makes; use those "
-            "versions, or choose another place"
+            f"{store.place}/{path} names other files (made by {makers(store)}) than {_versions(environment())} makes; "
+            "use those versions, or choose another place"
         )
     return there
 
@@ -224,11 +220,7 @@ def finish(store: Store) -> Release:
     Returns:
       The release as it is now; in the making if no subset is whole.
     """
-    if store.size(COPY) is not None:
-        release = Release.open(store)
-        write_plain_metadata(release)
-        return release
-    while True:
+    while store.size(COPY) is None:
         tag = store.version(MANIFEST)
         old = store.read(MANIFEST, MANIFEST_BYTES) if tag is not None else None
         recipes = read_recipes(store)

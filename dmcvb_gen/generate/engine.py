@@ -40,7 +40,7 @@ from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
-from dmcvb_gen.storage.store import NotThere, Store
+from dmcvb_gen.storage.store import Store
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 
@@ -148,7 +148,8 @@ def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> W
         episodes = simulated_episodes(work, first, threads)
         outcomes = [_settle(work, work.trajectories, episodes.arrays.items())]
     else:
-        episodes, outcomes = stored_episodes(work), []
+        arrays = read_shard(work, work.trajectories, ("physics", "length", "action"))
+        episodes, outcomes = Episodes(np.asarray(work.episodes), arrays), []
     if not work.images:
         tick(int((episodes.length + 1).sum()))
     for setting in work.settings:
@@ -237,16 +238,6 @@ def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) 
                 f"{digest[:12]}); bring back the file as it was, or give another --out"
             )
     return loaded or [random_policy(task)]
-
-
-def stored_episodes(work: Work) -> Episodes:
-    """Read what is rendered of the episodes of a shard.
-
-    Raises:
-      StoreError: the shard is damaged.
-    """
-    arrays = read_shard(work, work.trajectories, ("physics", "length", "action"))
-    return Episodes(np.asarray(work.episodes), arrays)
 
 
 def _drawn_labels(work: Work, record: SubsetRecord, episodes: Episodes, backgrounds: str) -> DistractorState:
@@ -356,7 +347,7 @@ def _fault(store: Store, path: str, file: ShardFile) -> str | None:
 def _difference(work: Work, layer: Layer, spec: ArraySpec, known: ShardRecord, values: np.ndarray) -> ArrayDifference:
     try:
         other = _read_array(work.store, layer, spec, work.shard, known)
-    except (StoreError, NotThere):
+    except StoreError:
         return ArrayDifference(spec.name, None, None)
     gap = np.abs(values.astype(np.float64) - other.astype(np.float64))
     return ArrayDifference(spec.name, float(gap.max()), float(gap.mean()))

@@ -12,6 +12,8 @@ from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.spec import DIFFICULTIES, FIXED, GOAL_MODES, LEVELS, distractor_kinds, is_maze
 from dmcvb_gen.version import __version__
 
+STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
+"""Of episode returns, in the order of tables."""
 PAPER_STEPS = {False: 1000, True: 1200}
 """Control steps at the time limit of the paper's data: locomotion, mazes."""
 
@@ -19,7 +21,7 @@ PAPER_STEPS = {False: 1000, True: 1200}
 def return_statistics(returns: np.ndarray) -> dict[str, float]:
     """Mean, std, min, quartiles and max of episode returns (NaN without episodes)."""
     if not len(returns):
-        return {name: float("nan") for name in ("mean", "std", "min", "p25", "median", "p75", "max")}
+        return dict.fromkeys(STATISTICS, float("nan"))
     low, p25, median, p75, high = np.quantile(returns, (0, 0.25, 0.5, 0.75, 1))
     values = dict(mean=returns.mean(), std=returns.std(), min=low, p25=p25, median=median, p75=p75, max=high)
     return {name: float(value) for name, value in values.items()}

@@ -106,7 +106,7 @@ def paint_release(
     """
     store, wanted = place if isinstance(place, Store) else open_store(place), wanted or Wanted()
     release = Release.open(store)
-    records = _paintable(release, only)
+    records = not_imported(release, chosen_subsets(release, only))
     root = local_inputs(store, release.inputs_of([record.name for record in records]))
     sources = {record.name: background_source(root, record, backgrounds) for record in records}
     layers = {record.name: _layers_of(release, record, wanted, sources[record.name]) for record in records}
@@ -132,12 +132,12 @@ def paint_release(
     return RenderResult(finish(store), len(outcomes), known, tuple(differing), drift)
 
 
-def _paintable(release: Release, only: Sequence[str]) -> list[SubsetRecord]:
-    """The subsets to paint: those that were not imported."""
-    records = [record for record in chosen_subsets(release, only) if not record.imported]
-    if not records:
+def not_imported(release: Release, records: Iterable[SubsetRecord]) -> list[SubsetRecord]:
+    """Those of a release's subsets that can be painted. Raises StoreError if all were imported."""
+    own = [record for record in records if not record.imported]
+    if not own:
         raise StoreError(f"{release.place} was imported and has no physics states to paint from")
-    return records
+    return own
 
 
 def _layers_of(release: Release, record: SubsetRecord, wanted: Wanted, source: str) -> list[Layer]:

@@ -48,6 +48,7 @@ COMMAND_LINE = "command line"
 """Where a recipe comes from that options alone describe."""
 MAX_STEPS = 5000
 """Longest episode that a recipe may ask for; a shard is held in memory."""
+_SHIPPED = resources.files("dmcvb_gen.generate") / "data" / "recipes"
 
 
 class _Model(pydantic.BaseModel):
@@ -290,12 +291,11 @@ def override(recipe: Recipe, **changes: Any) -> Recipe:
 
 def _overridden(pattern: dict[str, Any], each: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A pattern with other values; fixed goals, which count in another way, become a pattern of their own."""
-    fixed = [FIXED] * (FIXED in pattern["settings"])
     others = [setting for setting in pattern["settings"] if setting != FIXED]
     parts = [pattern | {key: value for key, value in each.items() if key != "fixed_goals"} | {"settings": others}]
-    if fixed:
+    if FIXED in pattern["settings"]:
         changed = {key: value for key, value in each.items() if key not in ("episodes", "steps")}
-        part = pattern | changed | {"settings": fixed}
+        part = pattern | changed | {"settings": [FIXED]}
         if count := each.get("episodes"):
             part["episodes_per_goal"] = -(-count // part["fixed_goals"])
         parts.append(part)
@@ -335,8 +335,7 @@ def check_options_used(recipe: Recipe, given: Collection[str]) -> None:
 
 def shipped_recipes() -> tuple[str, ...]:
     """Names of the recipes in the package."""
-    folder = resources.files("dmcvb_gen.generate") / "data" / "recipes"
-    return tuple(sorted(path.name.removesuffix(".yaml") for path in folder.iterdir() if path.name.endswith(".yaml")))
+    return tuple(sorted(path.name.removesuffix(".yaml") for path in _SHIPPED.iterdir() if path.name.endswith(".yaml")))
 
 
 def load_recipe(source: str | Path) -> Recipe:
@@ -351,9 +350,7 @@ def load_recipe(source: str | Path) -> Recipe:
         raise UnknownNameError("recipe", source, shipped_recipes())
     shipped = not path.is_file() and str(source) in shipped_recipes()
     try:
-        data = read_yaml(
-            resources.files("dmcvb_gen.generate") / "data" / "recipes" / f"{source}.yaml" if shipped else path
-        )
+        data = read_yaml(_SHIPPED / f"{source}.yaml" if shipped else path)
     except OSError as error:
         raise RecipeError(
             f"cannot read recipe {str(source)!r} ({error.strerror}); give a YAML file or one of the shipped: "

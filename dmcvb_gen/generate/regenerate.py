@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dmcvb_gen.dataset.gate import Release, read_records
-from dmcvb_gen.dataset.manifest import Layer, LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
+from dmcvb_gen.dataset.manifest import LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
 from dmcvb_gen.dataset.writer import (
     begin,
     check_agree,
@@ -34,7 +34,7 @@ from dmcvb_gen.generate.shipped import Shipped, record_digests
 from dmcvb_gen.generate.works import Work, chosen_subsets, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.spec import select
-from dmcvb_gen.storage.store import NotThere, Store, open_store
+from dmcvb_gen.storage.store import Store, open_store
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,7 @@ class Regeneration:
           DmcvbError: the shards cannot be made here (policy, videos or renderer missing).
         """
         release = Release.open(open_store(self.place))
-
-        def is_here(layer: Layer, shard: int) -> bool:
-            return shard in release.here(layer.name)
-
-        works = self._works(release, is_here, "check")
+        works = self._works(release, lambda layer, shard: shard in release.here(layer.name), "check")
         chosen = list(release.shards(release.select(self.only), self.episodes))
         left = sum(not shard.here for shard in chosen)
         return Outcome(self.run(works, progress), environment_diff(release.store), left)
@@ -237,7 +233,7 @@ def restore_lists(store: Store) -> list[str]:
             continue
         try:
             release.records(layer.name)
-        except (StoreError, NotThere) as error:
+        except StoreError as error:
             records = read_records(store, layer)
             text = canonical_json(LayerList(shards=tuple(records[n] for n in range(layer.shards) if n in records)))
             if sha256_bytes(text) != layer.list:

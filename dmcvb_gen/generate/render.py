@@ -40,29 +40,16 @@ def check_renderer(name: str) -> None:
         raise RenderingError(f"renderer {name!r} cannot start here: {reason}")
 
 
-def renderer_for(
-    record: SubsetRecord, backgrounds: str, split: str | None = None, **overrides: Any
-) -> tuple[Renderer, Any]:
+def renderer_for(record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]:
     """The renderer of a subset, and its videos (None if its distractor shows none).
 
     Args:
       backgrounds: "builtin" or a folder of videos.
-      split: "train" or "val" videos; the record's by default.
-      overrides: `name` and `samples`, instead of the record's.
     """
-    task, setting = get_task(record.task), record.distractor
-    videos = videos_of(record.model_copy(update={"split": split or record.split}), backgrounds)
-    choice = {"name": record.renderer["name"], "samples": record.renderer.get("samples")} | overrides
-    name = choice.pop("name")
-    renderer = make_renderer(
-        name,
-        task,
-        record.size,
-        backgrounds=videos,
-        floor_alpha=floor_alpha_for(task, setting),
-        **choice,
-    )
-    return renderer, videos
+    task, videos = get_task(record.task), videos_of(record, backgrounds)
+    choice: dict[str, Any] = {"backgrounds": videos, "floor_alpha": floor_alpha_for(task, record.distractor)}
+    choice["samples"] = record.renderer.get("samples")
+    return make_renderer(str(record.renderer["name"]), task, record.size, **choice), videos
 
 
 def videos_of(record: SubsetRecord, backgrounds: str) -> Backgrounds | None:
@@ -84,7 +71,7 @@ class RendererCache:
         if key not in self._made:
             if len(self._made) == MOST_RENDERERS or any(task != record.task for task, *_ in self._made):
                 self.close()
-            self._made[key] = renderer_for(record, backgrounds, record.split)[0]
+            self._made[key] = renderer_for(record, backgrounds)[0]
             atexit.unregister(self.close)
             atexit.register(self.close)  # now, before OpenGL's library ends: it may have come with this renderer
         return self._made[key]

@@ -20,7 +20,7 @@ from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
-from dmcvb_gen.generate.paint import bare, recipe_after
+from dmcvb_gen.generate.paint import bare, not_imported, recipe_after
 from dmcvb_gen.generate.render import check_renderer
 from dmcvb_gen.generate.resolve import (
     all_pictures,
@@ -80,9 +80,7 @@ def repaint(request: Repainting, workers: Workers | None = None, progress: Progr
     """
     store, release = open_store(local_path(request.out)), _source(request)
     names = release.select(request.only)
-    chosen = [record for record in release.manifest.subsets if record.name in names and not record.imported]
-    if not chosen:
-        raise StoreError(f"{request.root} was imported and has no physics states to paint from")
+    chosen = not_imported(release, [record for record in release.manifest.subsets if record.name in names])
     files: dict[str, Path] = {}
     layers: dict[str, Layer] = {}
     records: dict[str, SubsetRecord] = {}

@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 from dmcvb_gen.parallel.base import (
-    IN_FLIGHT,
     KEPT,
     Needs,
     Pool,
@@ -27,12 +26,9 @@ from dmcvb_gen.parallel.base import (
     Workers,
     expect,
     ignore,
-    limit_threads,
 )
 
 __all__ = [
-    "IN_FLIGHT",
-    "KEPT",
     "Needs",
     "Pool",
     "Ray",
@@ -42,7 +38,6 @@ __all__ = [
     "expect",
     "ignore",
     "in_order",
-    "limit_threads",
     "open_pool",
 ]
 

@@ -23,7 +23,7 @@ from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import BackgroundError, StoreError
-from dmcvb_gen.generate.info import describe_release
+from dmcvb_gen.generate.info import STATISTICS, describe_release
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
@@ -248,7 +248,6 @@ def _arrays(release: Release) -> dict[tuple, list[str]]:
 
 BACKGROUND = "background"
 """The part of a distractor that is told by its number of videos."""
-STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 
 
 def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, str]]:

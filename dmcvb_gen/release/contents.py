@@ -169,12 +169,11 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Iss
     recorded, release = subset.record.backgrounds, subset.release
     root = local_inputs(release.store, release.inputs_of([subset.name]))
     source = video_source(root, subset.record, backgrounds)
-    split = recorded["split"] if recorded else "train"
-    if recorded and load_backgrounds(source, split).digest != recorded["digest"]:
+    if recorded and load_backgrounds(source, recorded["split"]).digest != recorded["digest"]:
         message = f"backgrounds {source!r} are not those of the manifest; give --backgrounds"
         yield Issue("pixels", subset.name, message)
         return
-    renderer, _ = renderer_for(subset.record, source, split)
+    renderer, _ = renderer_for(subset.record, source)
     try:
         painted_here = np.flatnonzero(~subset.unpainted[subset.episodes])
         for episode, length in _sampled(subset, painted_here):

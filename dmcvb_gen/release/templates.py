@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import shlex
 from typing import Any
 
-from dmcvb_gen.text import printable
+from dmcvb_gen.text import printable, quoted
 
 MARKUP = str.maketrans({character: f"&#{ord(character)};" for character in "<>&[]|"})
 """Characters of which Markdown makes elements, links and cells -> the same characters as entities."""
@@ -38,5 +37,5 @@ def fill(name: str, **values: Any) -> str:
     )
     environment.filters["safe"] = Safe
     environment.filters["python"] = lambda text: Safe(json.dumps(printable(text, line=" ")))
-    environment.filters["shell"] = lambda text: Safe(shlex.quote(printable(text, line=" ")))
+    environment.filters["shell"] = lambda text: Safe(quoted(printable(text, line=" ")))
     return environment.get_template(name).render(**values)

@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import math
-import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -32,7 +31,7 @@ from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import is_url, local_path
 from dmcvb_gen.storage.places import shown as shown_place
 from dmcvb_gen.storage.store import open_store
-from dmcvb_gen.text import as_names
+from dmcvb_gen.text import as_names, quoted
 
 VIEWER = "preview/viewer.html"
 """Default place in the release."""
@@ -146,12 +145,12 @@ def _page(release: Release, parts: list[dict[str, Any]]) -> bytes:
 
 def _command(release: Release, path: str, subset: SubsetReader, index: int) -> str:
     """The command that makes an episode's shard again, or fetches it from a URL; "" if nothing can make it."""
-    what = f"--only {shlex.quote(subset.name)} --range {index}:{index + 1} --out regenerated"
+    what = f"--only {quoted(subset.name)} --range {index}:{index + 1} --out regenerated"
     if is_url(path):
-        return f"dmcvb-gen fetch {shlex.quote(shown_place(path))} {what}"
+        return f"dmcvb-gen fetch {quoted(shown_place(path))} {what}"
     if subset.record.imported:
         return ""
-    return f"dmcvb-gen regenerate {shlex.quote(str(Path(path).resolve()))} {what}"
+    return f"dmcvb-gen regenerate {quoted(Path(path).resolve())} {what}"
 
 
 # -- one episode ----------------------------------------------------------------------------------

@@ -145,8 +145,6 @@ class ObjectStore(Store):
         """Turn a store's words for a condition that does not hold into FileExistsError."""
         try:
             yield
-        except FileExistsError:
-            raise
         except Exception as error:
             cause = error.__cause__ or error
             words = f"{type(error).__name__} {error} {type(cause).__name__} {cause}"

@@ -60,7 +60,10 @@ class HubStore(Store):
 
     @property
     def _api(self) -> Any:
-        return new_api(self.endpoint, self.token)
+        """A `huggingface_hub.HfApi`; with the environment's endpoint and token by default."""
+        from huggingface_hub import HfApi
+
+        return HfApi(endpoint=self.endpoint, token=self.token)
 
     @property
     def _where(self) -> dict[str, str]:
@@ -187,10 +190,3 @@ class _Known(dict[str, Any]):
 
 def _blob(data: bytes) -> str:
     return hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
-
-
-def new_api(endpoint: str | None = None, token: str | None = None) -> Any:
-    """A `huggingface_hub.HfApi`; with the environment's endpoint and token by default."""
-    from huggingface_hub import HfApi
-
-    return HfApi(endpoint=endpoint, token=token)

@@ -45,7 +45,7 @@ def open_store(place: str | Path, options: Mapping[str, Any] | None = None) -> S
     if parsed.protocol in WEB:
         from dmcvb_gen.storage.web import HttpStore
 
-        return HttpStore.at(parsed, options or {})
+        return HttpStore(str(parsed), parsed.login, parsed.query, dict((options or {}).get("headers", {})))
     from dmcvb_gen.storage.bucket import ObjectStore
 
     return ObjectStore(parsed.protocol, parsed.path, options or {})

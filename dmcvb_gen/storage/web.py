@@ -13,7 +13,6 @@ from urllib.parse import quote
 
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.interface import PIECE, Store
-from dmcvb_gen.storage.places import Place
 
 TIMEOUT = (10, 60)
 """Seconds to connect, and between two packets."""
@@ -37,10 +36,6 @@ class HttpStore(Store):
     headers: Mapping[str, str] = field(default_factory=dict, repr=False, hash=False)
 
     writable = False
-
-    @classmethod
-    def at(cls, place: Place, options: Mapping[str, Any]) -> HttpStore:
-        return cls(str(place), place.login, place.query, dict(options.get("headers", {})))
 
     @property
     def place(self) -> str:

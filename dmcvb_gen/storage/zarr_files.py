@@ -41,7 +41,8 @@ class ZarrFiles(Store):
         path = f"{self.prefix}/{key}" if self.prefix else key
         data = await asyncio.to_thread(self.store.read_range, path, start, end - start)
         if len(data) == file.bytes and hashlib.sha256(data).hexdigest() != file.sha256:
-            _quiet()
+            # After an error, asyncio would print each of Zarr's other reads as a task that was destroyed.
+            logging.getLogger("asyncio").setLevel(logging.CRITICAL)
             raise StoreError(
                 f"{self.store.place}/{path} is damaged: it does not have its SHA-256; regenerate it, or fetch it with "
                 "--repair"
@@ -60,11 +61,6 @@ class ZarrFiles(Store):
         raise NotImplementedError("arrays are read by their records alone")
 
     set = delete = list = list_prefix = list_dir = _not_offered  # type: ignore[assignment]
-
-
-def _quiet() -> None:
-    """Let Zarr's other reads end unheard: after an error, asyncio would print each as a task that was destroyed."""
-    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
 
 
 def _range(part: ByteRequest | None, size: int) -> tuple[int, int]:

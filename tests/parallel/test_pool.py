@@ -12,7 +12,8 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
-from dmcvb_gen.parallel import IN_FLIGHT, in_order, open_pool
+from dmcvb_gen.parallel import in_order, open_pool
+from dmcvb_gen.parallel.base import IN_FLIGHT
 
 
 def square(number, tick):
