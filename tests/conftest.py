@@ -25,7 +25,7 @@ from dmcvb_gen.dataset.schema import decode  # noqa: E402
 from dmcvb_gen.dataset.writer import finish, put_shard  # noqa: E402
 from dmcvb_gen.generate.executors import run_works  # noqa: E402
 from dmcvb_gen.generate.plan import make_plan, start  # noqa: E402
-from dmcvb_gen.generate.recipe import make_recipe  # noqa: E402
+from dmcvb_gen.generate.recipe import Recipe, make_recipe  # noqa: E402
 from dmcvb_gen.generate.renderer_choice import default_renderer  # noqa: E402
 from dmcvb_gen.release.verify import verify_folder  # noqa: E402
 from dmcvb_gen.rendering.native import textures  # noqa: E402
@@ -55,14 +55,19 @@ WALKERS |= {"episodes": 3, "episodes_per_shard": 2}
 
 
 def small_recipe(**changes):
-    """Walker, random actions, three settings, 3 episodes in shards of 2, small pictures."""
-    fields = {"name": "small", "seed": 3, "size": 16, "renderer": {"backend": "native"}, "subsets": [WALKERS]}
-    return make_recipe(fields | changes)
+    """Walker, random actions, three settings, 3 episodes in shards of 2, small pictures.
+
+    Args:
+      changes: fields of the recipe or of its subsets.
+    """
+    own = {name: changes.pop(name) for name in [*changes] if name in Recipe.model_fields}
+    fields = {"name": "small", "seed": 3, "size": 16, "renderer": {"backend": "native"}, "subsets": [WALKERS | changes]}
+    return make_recipe(fields | own)
 
 
 def short_recipe(**changes):
-    """As `small_recipe`, with episodes of 20 steps; `changes` are of the subsets."""
-    return small_recipe(subsets=[WALKERS | {"max_steps": 20} | changes])
+    """As `small_recipe`, with episodes of 20 steps."""
+    return small_recipe(**({"max_steps": 20} | changes))
 
 
 def roll_out(recipe, folder, works=lambda works: works, workers=1, only=(), pixels=True):
@@ -80,8 +85,8 @@ TINY_MAZE = "ant-maze-tiny:****/*..*/****"
 
 def maze_recipe(settings=("visible",), **changes):
     """A maze of two cells, random actions, 2 episodes in shards of 1, small pictures."""
-    pattern = {"tasks": TINY_MAZE, "levels": "random", "settings": list(settings), "episodes": 2}
-    return small_recipe(name="mazes", seed=0, subsets=[pattern | {"episodes_per_shard": 1} | changes])
+    maze = {"tasks": TINY_MAZE, "settings": list(settings), "episodes": 2, "episodes_per_shard": 1}
+    return small_recipe(**({"name": "mazes", "seed": 0} | maze | changes))
 
 
 @pytest.fixture(scope="session")

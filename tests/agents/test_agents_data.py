@@ -21,8 +21,7 @@ from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset import steps as steps_module
 from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.generate.recipe import make_recipe
-from tests.conftest import roll_out
+from tests.conftest import roll_out, short_recipe
 
 LENGTHS = np.array([4, 7, 2])
 SIZE = 16
@@ -302,8 +301,7 @@ def test_without_held_out_episodes_there_is_no_test_loss():
 
 
 def test_agents_learn_actions_in_unit_bounds_from_data_with_the_tasks_own(tmp_path):
-    pattern = {"tasks": "quadruped-walk", "levels": "random", "settings": "none", "episodes": 2, "max_steps": 4}
-    roll_out(make_recipe({"name": "r", "size": 16, "subsets": [pattern]}), tmp_path / "r")
+    roll_out(short_recipe(tasks="quadruped-walk", settings="none", episodes=2, max_steps=4), tmp_path / "r")
     release = Release.open(tmp_path / "r")
     [subset] = release.subsets.values()
     spec = suite.load("quadruped", "walk").action_spec()

@@ -45,7 +45,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.references import reference_returns
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
-from tests.conftest import TINY_MAZE, invoke, maze_recipe, rewrite, roll_out, small_recipe
+from tests.conftest import TINY_MAZE, invoke, maze_recipe, rewrite, roll_out, short_recipe, small_recipe
 
 NAME = "walker-walk/expert/dynamic"
 
@@ -54,8 +54,7 @@ NAME = "walker-walk/expert/dynamic"
 def release(tmp_path_factory):
     """Two expert episodes with distractors, a shard each."""
     folder = tmp_path_factory.mktemp("validate") / "tiny"
-    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": ["dynamic"], "episodes": 2}
-    roll_out(small_recipe(name="tiny", subsets=[pattern | {"episodes_per_shard": 1}]), folder)
+    roll_out(small_recipe(name="tiny", levels="expert", settings="dynamic", episodes=2, episodes_per_shard=1), folder)
     return folder
 
 
@@ -129,8 +128,8 @@ def test_a_sound_release_passes_and_every_score_carries_its_profile(report):
 @pytest.mark.slow
 @pytest.mark.parametrize("task, setting", [("walker-walk", "dynamic"), ("ant-maze-empty7x7", "visible")])
 def test_label_budgets_are_validated_on_a_release_of_experts(task, setting, tmp_path, monkeypatch):
-    pattern = {"tasks": task, "levels": ["expert", "random"], "settings": setting, "episodes": 5, "max_steps": 30}
-    roll_out(small_recipe(subsets=[pattern]), tmp_path / "experts")
+    shape = dict(levels=["expert", "random"], settings=setting, episodes=5, max_steps=30)
+    roll_out(short_recipe(tasks=task, **shape), tmp_path / "experts")
     monkeypatch.setitem(BUDGETS, "smoke", replace(BUDGETS["smoke"], scores=True, readout_steps=0, episode_steps=30))
     result = validate(tmp_path / "experts", out=tmp_path / "out", benchmarks="b4", workers=1)
     facts = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -241,8 +240,7 @@ def test_another_release_or_budget_means_another_folder(scored, small_mazes, tmp
 @pytest.mark.slow
 def test_a_release_that_grows_is_the_same_and_its_cells_are_made_again(scored, tmp_path):
     def grown(episodes):
-        pattern = {"tasks": "walker-walk", "levels": "random", "settings": ["none"], "episodes_per_shard": 1}
-        roll_out(small_recipe(subsets=[pattern | {"episodes": episodes}]), tmp_path / "grows")
+        roll_out(short_recipe(settings="none", episodes_per_shard=1, episodes=episodes), tmp_path / "grows")
 
     grown(1)
     scored(["state-bc", "state-td3-bc"], tmp_path / "out", tmp_path / "grows")
@@ -470,11 +468,11 @@ def test_data_that_show_what_evaluation_shows_are_warned_of(tmp_path, small_rele
     """By the split that was asked for, or because a folder of one video has no other; states show neither."""
     (tmp_path / "one").mkdir()
     Image.fromarray(np.arange(64 * 64 * 3, dtype=np.uint8).reshape(64, 64, 3)).save(tmp_path / "one/video.png")
-    walker = {"tasks": "walker-walk", "levels": "random", "episodes": 1, "max_steps": 3}
+    walker = dict(episodes=1, max_steps=3)
     seen = {
-        "val": small_recipe(split="val", subsets=[walker | {"settings": ["static", "none"]}]),
-        "one": small_recipe(backgrounds=str(tmp_path / "one"), subsets=[walker | {"settings": ["dynamic"]}]),
-        "maze": maze_recipe(max_steps=3).model_copy(update={"split": "val"}),
+        "val": short_recipe(split="val", settings=["static", "none"], **walker),
+        "one": short_recipe(backgrounds=str(tmp_path / "one"), settings="dynamic", **walker),
+        "maze": maze_recipe(max_steps=3, split="val"),
     }
     for name, recipe in seen.items():
         roll_out(recipe, tmp_path / "made" / name)
@@ -515,8 +513,7 @@ def test_returns_unlike_the_policys_own_fail(release):
 @pytest.mark.parametrize("repeat", [1, 4])
 def test_returns_of_actions_held_for_longer_are_compared_with_nothing(repeat, tmp_path):
     """At repeat 1 the policies hold their actions for two steps, as when they were measured."""
-    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 4}
-    roll_out(small_recipe(action_repeat=repeat, subsets=[pattern]), tmp_path / "repeat")
+    roll_out(small_recipe(levels="expert", settings="none", episodes=4, action_repeat=repeat), tmp_path / "repeat")
     result = validate(tmp_path / "repeat", out=tmp_path / "out", agents="state-bc", workers=1)
     facts = json.loads(result.facts.read_text())
     assert result.sound and not result.warnings, result.structure

@@ -6,7 +6,7 @@ import pytest
 
 from dmcvb_gen import spec
 from dmcvb_gen.errors import UnknownNameError
-from dmcvb_gen.spec import DistractorSetting, GoalMode, Level, MazeName, SubsetSpec
+from dmcvb_gen.spec import GoalMode, Level, MazeName, SubsetSpec
 from dmcvb_gen.tasks import get_task, task_ids
 
 
@@ -32,18 +32,6 @@ def test_maze_names_go_there_and_back(task_id):
 )
 def test_subsets_have_one_name(parts, name):
     assert SubsetSpec.parse(*parts).name == name
-
-
-def test_a_subset_has_a_distractor_and_a_goal_mode():
-    walker = SubsetSpec.parse("walker-walk", "expert", "static_hard")
-    assert (walker.level, walker.distractor, walker.goal) == (Level.EXPERT, DistractorSetting("static", "hard"), None)
-    maze = SubsetSpec.parse("ant-maze-empty7x7", "random", "hidden")
-    assert (maze.distractor, maze.goal, maze.setting) == (DistractorSetting(), GoalMode.HIDDEN, "hidden")
-
-
-def test_a_goal_mode_is_no_setting_of_the_walker():
-    with pytest.raises(UnknownNameError, match="Known"):
-        SubsetSpec.parse("walker-walk", "expert", "hidden")
 
 
 def test_goals_are_hidden_and_cameras_move_if_the_setting_says_so():

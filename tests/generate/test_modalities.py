@@ -18,7 +18,7 @@ from dmcvb_gen.generate.modalities.parts import AGENT, BACKGROUND, FLOOR, GOAL, 
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import get_task
-from tests.conftest import invoke, roll_out, small_recipe
+from tests.conftest import invoke, roll_out, short_recipe
 
 MODALITIES = ["depth", "segmentation", "flow", "parts"]
 
@@ -29,8 +29,7 @@ def test_modalities_go_from_a_release_to_an_export(family, tmp_path, maze_releas
     source = maze_release
     if family != "maze":
         task = {"locomotion": "humanoid-walk", "suite": "hopper-hop"}[family]
-        pattern = {"tasks": task, "levels": "random", "settings": ["dynamic"], "episodes": 2, "max_steps": 6}
-        roll_out(small_recipe(subsets=[pattern]), source := tmp_path / "source")
+        roll_out(short_recipe(tasks=task, settings="dynamic", episodes=2, max_steps=6), source := tmp_path / "source")
     repaint(Repainting(source, tmp_path / "r", size=16, labels=MODALITIES))
     assert verify(tmp_path / "r").sound
     [(name, subset)] = Release.open(tmp_path / "r").subsets.items()

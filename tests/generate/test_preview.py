@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -46,12 +44,11 @@ def test_each_row_of_a_maze_has_a_label_above_it(maze_release, small_release):
     assert episode_strip(walker, 0, columns=20, scale=2).shape[0] == LABEL_HEIGHT + 32
 
 
-def test_a_preview_is_written_through_no_link(small_release, tmp_path):
-    shutil.copytree(small_release, tmp_path / "r")
-    (tmp_path / "r/preview").mkdir(exist_ok=True)
+def test_a_preview_is_written_through_no_link(copy, tmp_path):
+    (copy / "preview").mkdir(exist_ok=True)
     (tmp_path / "victim").write_text("mine")
-    (tmp_path / "r/preview/contact_sheet.png").unlink(missing_ok=True)
-    (tmp_path / "r/preview/contact_sheet.png").symlink_to(tmp_path / "victim")
+    (copy / "preview/contact_sheet.png").unlink(missing_ok=True)
+    (copy / "preview/contact_sheet.png").symlink_to(tmp_path / "victim")
     with pytest.raises(StoreError, match="is a link"):
-        write_preview(tmp_path / "r")
+        write_preview(copy)
     assert (tmp_path / "victim").read_text() == "mine"

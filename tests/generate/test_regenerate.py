@@ -14,7 +14,7 @@ from dmcvb_gen.dataset.manifest import record_path
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.repaint import Repainting, repaint
-from tests.conftest import invoke, rewrite, roll_out, short_recipe, small_recipe
+from tests.conftest import invoke, rewrite, roll_out, short_recipe
 from tests.dataset.oracle import contents
 
 NAME = "walker-walk/random/dynamic"
@@ -127,8 +127,8 @@ def test_videos_and_policies_that_are_lost_are_put_back(tmp_path):
     for name, gray in {"train/0.png": 0, "train/1.png": 90, "val/0.png": 200}.items():
         (tmp_path / "videos" / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(np.full((16, 16, 3), gray, np.uint8)).save(tmp_path / "videos" / name)
-    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "static", "episodes": 1, "max_steps": 3}
-    roll_out(small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "videos")), tmp_path / "r")
+    one = dict(levels="expert", settings="static", episodes=1, max_steps=3)
+    roll_out(short_recipe(**one, backgrounds=str(tmp_path / "videos")), tmp_path / "r")
     before = contents(tmp_path / "r")
     for name, message in {"train/00000.png": "are not those that", "val/00000.png": "run `dmcvb-gen reg"}.items():
         [frame] = (tmp_path / "r/backgrounds").glob(f"*/{name}")

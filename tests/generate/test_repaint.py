@@ -16,7 +16,7 @@ from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
-from tests.conftest import records, rewrite, roll_out, small_recipe
+from tests.conftest import records, rewrite, roll_out, short_recipe
 
 
 @pytest.fixture
@@ -135,14 +135,11 @@ def test_a_damaged_source_is_not_painted(copy, tmp_path):
         repaint(Repainting(copy, tmp_path / "r", ["*/*/none"], size=8))
 
 
-MAZE = {"tasks": "ant-maze-empty7x7", "levels": "random", "settings": ["visible", "hidden"], "episodes": 2}
-
-
 @pytest.mark.slow
 def test_a_maze_repainted_for_evaluation_is_what_its_rollout_would_be(tmp_path):
-    recipe = {"subsets": [MAZE | {"max_steps": 3}], "size": 8}
-    roll_out(small_recipe(**recipe), tmp_path / "train")
-    wanted = roll_out(small_recipe(**recipe, split="val"), tmp_path / "wanted")
+    maze = dict(tasks="ant-maze-empty7x7", settings=["visible", "hidden"], episodes=2, max_steps=3, size=8)
+    roll_out(short_recipe(**maze), tmp_path / "train")
+    wanted = roll_out(short_recipe(**maze, split="val"), tmp_path / "wanted")
     found = repaint(Repainting(tmp_path / "train", tmp_path / "val", split="val"), 1)
     assert records(found) == records(wanted)
     assert {subset.split for subset in found.manifest.subsets} == {"val"}

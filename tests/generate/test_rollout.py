@@ -219,7 +219,7 @@ SUBSET = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episo
 )
 def test_recipes_that_make_no_sense_are_refused_before_any_work(tmp_path, changes, error, words):
     with pytest.raises(error, match=words):
-        make_plan(small_recipe(**changes), tmp_path / "r")
+        make_plan(make_recipe(small_recipe().model_dump(mode="json") | changes), tmp_path / "r")
     assert not (tmp_path / "r").exists()
 
 
@@ -277,9 +277,11 @@ def test_a_recipe_takes_other_values_and_none_is_dropped():
 def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_this_machine(tmp_path):
     shutil.copytree(builtin_folder(), tmp_path / "mine/videos")
     shutil.copy(bundled_policies("walker-walk", "expert")[0], tmp_path / "mine/own.safetensors")
-    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "dynamic", "episodes": 1, "max_steps": 3}
-    pattern["policies"] = {"expert": str(tmp_path / "mine/own.safetensors")}
-    recipe = small_recipe(subsets=[pattern], backgrounds=str(tmp_path / "mine/videos"), size=8)
+    mine = {
+        "backgrounds": str(tmp_path / "mine/videos"),
+        "policies": {"expert": str(tmp_path / "mine/own.safetensors")},
+    }
+    recipe = short_recipe(levels="expert", settings="dynamic", episodes=1, max_steps=3, size=8, **mine)
     release = roll_out(recipe, tmp_path / "r")
     shutil.rmtree(tmp_path / "mine")
     for path in [*(tmp_path / "r").glob("*.json"), *(tmp_path / "r/recipes").iterdir()]:

@@ -10,9 +10,8 @@ import pandas
 import pyarrow.parquet as pq
 import pytest
 
-from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.release.export import export
-from tests.conftest import roll_out
+from tests.conftest import roll_out, short_recipe
 
 
 def test_an_episode_is_a_row_group_and_statistics_have_quantiles(stored, tmp_path):
@@ -58,9 +57,7 @@ def lerobots_features(info):
 @pytest.mark.parametrize("task", ["pendulum-swingup", "swimmer-swimmer6"])
 def test_one_action_and_broken_rates_fit_lerobots_own_checks(task, tmp_path):
     """A pendulum has one action; a swimmer takes 16.67 steps a second, and LeRobot's rates are whole numbers."""
-    pattern = {"tasks": task, "levels": "random", "settings": "none", "episodes": 2, "max_steps": 30}
-    fields = {"name": "r", "size": 16, "renderer": {"backend": "native"}, "subsets": [pattern]}
-    roll_out(make_recipe(fields), tmp_path / "r")
+    roll_out(short_recipe(tasks=task, settings="none", episodes=2, max_steps=30), tmp_path / "r")
     [folder] = export(str(tmp_path / "r"), "lerobot", tmp_path / "out")
     info = json.loads((folder / "meta/info.json").read_text())
     path = str(folder / "data/chunk-000/file-000.parquet")

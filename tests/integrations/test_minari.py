@@ -13,7 +13,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.references import reference_returns
 from dmcvb_gen.release.export import export
 from dmcvb_gen.tasks import get_task
-from tests.conftest import roll_out, small_recipe
+from tests.conftest import roll_out, short_recipe
 from tests.distractors.test_backgrounds import write_frames
 
 
@@ -65,9 +65,8 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
     for split, grey in (("train", 10), ("val", 250)):
         frames = np.full((3, 256, 256, 3), (grey, 0, 255 - grey), np.uint8)
         write_frames(tmp_path / "videos" / split / "one", frames, "png")
-    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "static", "episodes": 1, "max_steps": 3}
     shown = {"backgrounds": str(tmp_path / "videos"), "split": "val", "size": 32}
-    recipe = small_recipe(subsets=[pattern], action_repeat=1, **shown)
+    recipe = short_recipe(settings="static", episodes=1, max_steps=3, action_repeat=1, **shown)
     videos = roll_out(recipe, tmp_path / "r").manifest.subsets[0].backgrounds["source"]
     export(str(tmp_path / "r"), "minari", tmp_path / "out")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
@@ -86,8 +85,7 @@ def test_the_environment_of_the_data_shows_its_split_and_the_videos_that_it_is_g
 
 
 def test_references_are_of_episodes_as_long_as_the_datas(maze_release, tmp_path):
-    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2, "max_steps": 10}
-    roll_out(small_recipe(subsets=[pattern]), tmp_path / "short")
+    roll_out(short_recipe(settings="none", episodes=2, max_steps=10), tmp_path / "short")
     release = dmcvb_gen.open(str(tmp_path / "short"))
     record = release["walker-walk/random/none"].record
     assert reference_returns(release, record) is None  # the package's expert was measured over 500 steps

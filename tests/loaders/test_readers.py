@@ -208,7 +208,6 @@ def test_values_that_make_no_sense_are_refused_by_name(subset):
         (lambda: next(subset.batches(8, buffer=0)), "buffer is 0; give a whole number"),
         (lambda: next(subset.batches(8, seed=-1)), "seed is -1; give a whole number of at least 0"),
         (lambda: subset.source(stack=-1), "stack is -1; give a whole number"),
-        (lambda: subset.torch("steps", stack=0), "stack is 0; give a whole number"),
     ):
         with pytest.raises(DmcvbError, match=words):
             make()

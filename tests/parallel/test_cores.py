@@ -25,12 +25,6 @@ def test_free_memory_is_some_of_what_the_machine_has():
     assert 0 < free_memory() < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def test_a_system_without_affinities_gives_all_cores(tmp_path, monkeypatch):
-    monkeypatch.delattr(cores.os, "sched_getaffinity", raising=False)
-    monkeypatch.setattr(cores, "CONTAINER", tmp_path)
-    assert cores.usable_cores() == os.cpu_count()
-
-
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no processes")
 def test_a_process_that_is_pinned_to_one_core_counts_one():
     code = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])\n"

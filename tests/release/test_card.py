@@ -22,7 +22,8 @@ from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
-from tests.conftest import invoke, roll_out, small_recipe
+from tests.conftest import invoke, roll_out, short_recipe, small_recipe
+from tests.fake_hub import content
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +38,6 @@ def carded(small_release, tmp_path_factory):
 def copy(carded, tmp_path):
     shutil.copytree(carded, tmp_path / "copy")
     return tmp_path / "copy"
-
-
-def content(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_the_header_is_what_hugging_face_reads(carded):
@@ -134,9 +131,8 @@ HOSTILE = "<img src=x>[a](javascript:alert(1))|b`\"'"
 
 
 def test_names_become_no_markup(tmp_path):
-    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 3}
     facts = {"authors": [HOSTILE], "license": HOSTILE, "description": HOSTILE, "size": 8}
-    roll_out(small_recipe(subsets=[pattern], **facts), tmp_path / "r")
+    roll_out(short_recipe(settings="none", episodes=1, max_steps=3, **facts), tmp_path / "r")
     written = write_card(tmp_path / "r", tmp_path / "card")
     assert all(file.is_file() and tmp_path / "card" in file.parents for file in written)
     _, header, text = (tmp_path / "card/README.md").read_text().split("---\n", 2)
@@ -175,8 +171,7 @@ def test_the_card_of_a_part_is_compared_by_its_rows(carded, tmp_path):
 
 
 def test_longer_episodes_are_not_compared_with_the_papers(tmp_path):
-    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 501}
-    roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "r")
+    roll_out(short_recipe(settings="none", episodes=1, max_steps=501, size=8), tmp_path / "r")
     write_card(tmp_path / "r")
     text = " ".join((tmp_path / "r/README.md").read_text().split())
     assert "| DMC-VB paper |" in text and "(z = " not in text
@@ -184,8 +179,7 @@ def test_longer_episodes_are_not_compared_with_the_papers(tmp_path):
 
 @pytest.mark.parametrize("repeat, held", [(1, "one control step"), (2, "two control steps"), (4, "four control steps")])
 def test_the_control_steps_of_a_step_are_the_recipes(repeat, held, tmp_path):
-    pattern = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 1, "max_steps": 2}
-    roll_out(small_recipe(subsets=[pattern], size=8, action_repeat=repeat), tmp_path / "r")
+    roll_out(short_recipe(settings="none", episodes=1, max_steps=2, size=8, action_repeat=repeat), tmp_path / "r")
     write_card(tmp_path / "r")
     text = (tmp_path / "r/README.md").read_text()
     assert f"A step is {held} with the same action." in text

@@ -207,16 +207,22 @@ def test_no_wrong_byte_is_taken(tmp_path):
     assert not wrong_files(made)
 
 
+def spoil(root, lost):
+    """Change a byte of one file of a release, cut a second one and remove a third; the paths of the first two."""
+    wrong, short = (f"hop/random.zarr/none/pixels/c/{number}/0/0/0/0" for number in range(2))
+    (root / wrong).write_bytes((root / wrong).read_bytes()[:-1] + b"x")
+    (root / short).write_bytes(b"half")
+    (root / lost).unlink()
+    return wrong, short
+
+
 @pytest.mark.parametrize("hub", [False, True], ids=["folder", "hub"])
 def test_what_was_damaged_or_lost_there_is_found_and_replaced(made, tmp_path, monkeypatch, hub):
     there = fake_hub(tmp_path / "hub", monkeypatch).folder if hub else tmp_path / "there"
     url, before = "hf://datasets/me/tiny" if hub else f"file:{there}", content(made)
     publish(made, url)
-    wrong, short = (f"hop/random.zarr/none/pixels/c/{number}/0/0/0/0" for number in range(2))
     lost = "hop/random.zarr/dynamic/pixels/c/0/0/0/0/0"
-    (there / wrong).write_bytes(before[wrong][:-1] + b"x")
-    (there / short).write_bytes(b"half")
-    (there / lost).unlink()
+    wrong, short = spoil(there, lost)
     found = [str(issue) for issue in verify(url).findings]
     assert sum(short in text or lost in text for text in found) == 2
     assert any(wrong in str(issue) for issue in verify(url, everything=True).findings)
@@ -229,11 +235,7 @@ def test_what_was_damaged_or_lost_there_is_found_and_replaced(made, tmp_path, mo
 def test_a_fetch_finds_another_size_and_with_repair_another_digest(made, tmp_path):
     back, before = tmp_path / "back", content(made)
     fetch(f"file:{made}", back)
-    wrong, short = (f"hop/random.zarr/none/pixels/c/{number}/0/0/0/0" for number in range(2))
-    lost = "records/hop/random/none/labels/00000.json"
-    (back / wrong).write_bytes(before[wrong][:-1] + b"x")
-    (back / short).write_bytes(b"half")
-    (back / lost).unlink()
+    wrong, _ = spoil(back, "records/hop/random/none/labels/00000.json")
     fetch(f"file:{made}", back)
     assert {path for path, data in content(back).items() if data != before[path]} == {wrong}
     fetch(f"file:{made}", back, repair=True)

@@ -13,7 +13,7 @@ from dmcvb_gen.files import sha256_file
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify, verify_folder
-from tests.conftest import invoke, rewrite, roll_out, small_recipe, wrong_files
+from tests.conftest import invoke, rewrite, roll_out, short_recipe, wrong_files
 
 NAME, MAZE = "walker-walk/random/dynamic", "ant-maze-tiny/random/visible"
 
@@ -27,8 +27,6 @@ def test_a_sound_release_passes(release, request):
     result = verify(folder)
     assert result.sound and result.complete and COUNTS[release].items() <= result.checked.items()
     assert result.digest == sha256_file(folder / "manifest.json") and not result.compared
-    said = invoke("verify", f"{folder}@sha256:{'0' * 64}", code=2).output
-    assert f"is release {result.digest}, not 0000" in said
 
 
 def test_all_count_the_files_that_the_digest_covers(small_release, tmp_path):
@@ -86,8 +84,8 @@ def test_equal_actions_alone_are_no_duplicate(copy):
 
 
 def test_returns_of_longer_episodes_may_be_higher(tmp_path):
-    pattern = {"tasks": "walker-walk", "levels": "expert", "settings": "none", "episodes": 1, "max_steps": 600}
-    roll_out(small_recipe(subsets=[pattern], size=8, seed=4), tmp_path / "long")
+    one = dict(levels="expert", settings="none", episodes=1, max_steps=600)
+    roll_out(short_recipe(**one, size=8, seed=4), tmp_path / "long")
     assert Release.open(tmp_path / "long")["walker-walk/expert/none"].returns.max() > 1000
     assert verify(tmp_path / "long").sound
     [policy] = (tmp_path / "long/policies").iterdir()

@@ -16,7 +16,7 @@ import dmcvb_gen
 from dmcvb_gen.errors import DmcvbError, StoreError, UnknownNameError
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.viewer import view
-from tests.conftest import invoke, roll_out, small_recipe
+from tests.conftest import invoke, roll_out, short_recipe
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SCRIPTS = ("watch_viewer.js", "drive_viewer.js")
@@ -105,9 +105,8 @@ def test_the_command_writes_and_refuses(small_release, tmp_path):
 
 
 def test_lamps_have_curves_and_a_url_the_command_that_fetches(tmp_path):
-    pattern = {"tasks": "walker-walk", "levels": "random", "episodes": 1, "max_steps": 3}
-    pattern |= {"settings": "dynamic_camera0.2-light0.2"}
-    folder = roll_out(small_recipe(subsets=[pattern], size=8), tmp_path / "lamps").path
+    recipe = short_recipe(settings="dynamic_camera0.2-light0.2", episodes=1, max_steps=3, size=8)
+    folder = roll_out(recipe, tmp_path / "lamps").path
     for place, command in ((folder, f"regenerate {folder}"), (f"file://{folder}", f"fetch file://{folder}")):
         [episode] = page_data(view(str(place), tmp_path / "page.html").path)
         names = {curve["name"] for curve in episode["curves"]["distractor"]}

@@ -12,13 +12,12 @@ from dm_control.utils import rewards
 
 from dmcvb_gen.arithmetic import to_unit
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.own_code import TASKS as ALLOWED
 from dmcvb_gen.own_code import allow
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, PHYSICS_SPEC, get_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
-from tests.conftest import invoke, rewrite, roll_out
+from tests.conftest import invoke, rewrite, roll_out, small_recipe
 from tests.tasks.test_own_tasks import check_episode, rolled
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
@@ -160,8 +159,7 @@ def test_the_code_of_a_task_of_ones_own_runs_only_if_a_person_named_it(tmp_path,
 def test_a_release_of_ones_own_task_is_verified_by_replay_and_not_checked_without_its_code(tmp_path, monkeypatch):
     ten_lines(tmp_path, monkeypatch, OWN)
     monkeypatch.setenv(ALLOWED, "arm_tasks:ends")
-    pattern = {"tasks": "arm_tasks:ends", "levels": "random", "settings": "none", "episodes": 2}
-    roll_out(make_recipe({"name": "r", "size": 16, "subsets": [pattern]}), tmp_path / "r")
+    roll_out(small_recipe(tasks="arm_tasks:ends", settings="none", renderer={}), tmp_path / "r")
     assert verify(tmp_path / "r").sound
 
     name = "arm_tasks-ends/random/none"
