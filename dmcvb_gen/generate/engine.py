@@ -217,8 +217,7 @@ def _check_code(name: str, makes: Mapping[str, Any], now: Any) -> None:
     """Raises StoreError if the code of one's own that a layer was begun with is another one now."""
     if makes.get("code", now) != now:
         raise StoreError(
-            f"the code of {name} is not what the release was begun with; bring back the file as it was, or give "
-            "another --out"
+            f"the code of {name} has changed since the release was begun; put the old file back, or give another --out"
         )
 
 

@@ -184,10 +184,10 @@ def remake(
         for layer in (layer for layer in work.layers if layer.name in known.records):
             record, digests = made.records(layer.name).get(work.shard), known.records[layer.name]
             if work.shard < len(digests):
-                equal, place = record is not None, (layer.name, work.shard)
-                equal = equal and sha256_bytes(canonical_json(record)) == digests[work.shard]
-                if place not in fresh:  # it was there before, and its files may have changed since
-                    equal = equal and not any(wrong_bytes(store, file) for file in shards[place].files)
+                place = layer.name, work.shard
+                equal = record is not None and sha256_bytes(canonical_json(record)) == digests[work.shard]
+                if equal and place not in fresh:  # it was there before, and its files may have changed since
+                    equal = not any(wrong_bytes(store, file) for file in shards[place].files)
                 outcomes[place] = ShardOutcome.of(layer, work.shard, equal=equal)
     return Outcome(tuple(outcomes.values()), {})
 

@@ -47,9 +47,11 @@ def renderer_for(record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]
       backgrounds: "builtin" or a folder of videos.
     """
     task, videos = get_task(record.task), videos_of(record, backgrounds)
-    choice: dict[str, Any] = {"backgrounds": videos, "floor_alpha": floor_alpha_for(task, record.distractor)}
-    choice["samples"] = record.renderer.get("samples")
-    return make_renderer(str(record.renderer["name"]), task, record.size, **choice), videos
+    look: dict[str, Any] = {
+        "floor_alpha": floor_alpha_for(task, record.distractor),
+        "samples": record.renderer.get("samples"),
+    }
+    return make_renderer(str(record.renderer["name"]), task, record.size, backgrounds=videos, **look), videos
 
 
 def videos_of(record: SubsetRecord, backgrounds: str) -> Backgrounds | None:

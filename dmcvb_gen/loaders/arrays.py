@@ -90,6 +90,7 @@ class PairedArray(ComputedArray):
         """See `ComputedArray.rows`."""
         (_, steps, *rest), episodes = self.shape, np.asarray(episodes)
         joined = np.empty((len(episodes), len(range(steps)[:rows]), *rest), self.dtype)
-        for index in np.ndindex(len(episodes), len(self._parts)):
-            joined[index[0], :, index[1]] = self._parts[index[1]].rows(episodes[index[0], None], rows)[0]
+        for row, episode in enumerate(episodes):  # one by one, which copies least
+            for look, part in enumerate(self._parts):
+                joined[row, :, look] = part.rows(np.array([episode]), rows)[0]
         return joined

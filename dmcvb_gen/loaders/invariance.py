@@ -85,7 +85,7 @@ def _real(looks: Sequence[DistractorState]) -> np.ndarray:
     """(look * image, label) of the labels that are real numbers; one that a look does not vary is zero in it."""
     labels = [dict(look.items()) for look in looks]
     real = {name: value for look in labels for name, value in look.items() if value.dtype.kind == "f"}
-    found = [np.concatenate([look.get(name, 0 * value) for look in labels]) for name, value in real.items()]
+    found = [np.concatenate([look.get(name, np.zeros_like(value)) for look in labels]) for name, value in real.items()]
     return np.concatenate([value.reshape(len(value), -1) for value in found], axis=1).astype(float)
 
 

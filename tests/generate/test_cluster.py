@@ -88,7 +88,7 @@ def test_parts_notice_that_code_of_ones_own_has_changed(task, tmp_path, monkeypa
     run("cluster", "begin", *words, "--out", tmp_path / "r")
     monkeypatch.setattr(resolve, "source_digest", lambda module: "0" * 64)
     refused = invoke("cluster", "part", tmp_path / "r", "1/1", code=2).output
-    assert f"the code of {'grey' if OWN[task] != 'none' else task} is not what" in refused
+    assert f"the code of {'grey' if OWN[task] != 'none' else task} has changed since" in refused
 
 
 @pytest.mark.slow
