@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -78,20 +78,24 @@ class StoredArray:
             return cast(np.ndarray, self._array.oindex[selection])
 
     def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
-        """(episode, ...) values of episodes in any order; of arrays with steps, those in a row are read at once.
+        """(episode, ...) values of episodes in any order; neighbors are read at once.
 
-        Zarr's own selection of scattered rows takes thirty times as long for pictures.
+        Zarr's own selection of scattered rows takes half the time for small arrays, thirty times the time for pictures.
 
         Args:
           rows: read the first rows of the step axis alone.
         """
         self._check_here(episodes)
+        order = np.argsort(episodes, kind="stable")
+        wanted, rest = episodes[order], (slice(rows),) * (self.ndim > 1)
         with storage_errors(self._place, decoding=True):
-            if self.ndim == 1:
-                return cast(np.ndarray, self._array.oindex[episodes])
-            runs = np.split(episodes, np.flatnonzero(np.diff(episodes) != 1) + 1)
-            read = [cast(np.ndarray, self._array[int(run[0]) : int(run[-1]) + 1, :rows]) for run in runs]
-            return read[0] if len(read) == 1 else np.concatenate(read)
+            runs = np.split(wanted, np.flatnonzero(np.diff(wanted) != 1) + 1)
+            if len(runs) == 1 or "height" in self.dimensions:
+                read = [self._array[(slice(int(run[0]), int(run[-1]) + 1), *rest)] for run in runs]
+            else:
+                read = [self._array.oindex[(wanted, *rest)]]
+            values = cast(np.ndarray, read[0] if len(read) == 1 else np.concatenate(read))
+        return values if np.array_equal(wanted, episodes) else values[np.argsort(order)]
 
     def _check_here(self, selection: Any) -> None:
         """Raises StoreError for an episode that is not here, which would read as zero or black."""
@@ -341,6 +345,13 @@ class Subset:
         used = np.arange(int(length.max(initial=-1)) + 1) <= length[:, None]
         read = ((name, self._read(name, chosen, used.shape[1])) for name in arrays)
         return {name: value.reshape(-1, *value.shape[2:]) if used.all() else value[used] for name, value in read}
+
+    def seen(self, pictures: Sequence[str], episodes: np.ndarray, rows: int) -> Iterator[list[np.ndarray]]:
+        """Pictures of episodes, some at a time, to look at only: in their order (episode, at least `rows`, ...).
+
+        Of several looks, all pictures of one come before those of the next.
+        """
+        yield [self._read(name, episodes, rows) for name in pictures]
 
     def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
         """The stored labels of the distractors, leading shape (episode, step); see `read`."""

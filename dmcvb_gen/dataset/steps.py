@@ -17,7 +17,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -118,13 +118,14 @@ class StepTable:
             few = max(1, READ_BYTES // (3 * size**2 * (1 + int(length.max(initial=0)))))
             part.subset.prepare(part.episodes, part.pictures)
             for episode in range(0, max(1, len(length)), few):
-                read = part.subset.rows([*FIELDS, *part.pictures], part.episodes[episode : episode + few])
-                for name, found in values.items():
-                    found.append(read[name])
-                after = row + len(read["state"])
+                chosen, ends = part.episodes[episode : episode + few], 1 + length[episode : episode + few]
+                for name, found in part.subset.rows(FIELDS, chosen).items():
+                    values[name].append(found)
                 if frames is not None:
-                    _fill(frames[row:after], [read[name] for name in part.pictures], border)
-                row = after
+                    _fill_all(
+                        frames[row:], part.subset.seen(part.pictures, chosen, int(ends.max(initial=0))), ends, border
+                    )
+                row += int(ends.sum())
                 tick(row / max(1, rows))
         fields = {name: np.concatenate(found) for name, found in values.items()}
         episodes = np.concatenate([part.episodes for part in parts])
@@ -137,7 +138,10 @@ class StepTable:
         count, size, frames = len(read["state"]), subset.record.size, None
         if pictures:
             frames = np.empty((count, subset.looks * 3 * len(pictures), size, size), np.uint8)
-            _fill(frames, [read[name] for name in pictures])
+            shown = [read[name] for name in pictures]
+            if subset.looks > 1:
+                shown = [picture[:, look] for look in range(subset.looks) for picture in shown]
+            _fill(frames, shown)
         return cls(read, np.array([count - 1]), frames, np.array([episode]), rows.start, subset.looks)
 
     def __len__(self) -> int:
@@ -176,14 +180,18 @@ class StepTable:
         return values
 
 
+def _fill_all(frames: np.ndarray, seen: Iterator[Sequence[np.ndarray]], ends: np.ndarray, border: int = 0) -> None:
+    """Put the pictures of whole episodes, see `Subset.seen`, one after the other; `ends` are their rows."""
+    episodes = (pictures for some in seen for pictures in zip(*some, strict=True))
+    for last, rows, pictures in zip(np.cumsum(ends), ends, episodes, strict=True):
+        _fill(frames[last - rows : last], [picture[:rows] for picture in pictures], border)
+
+
 def _fill(frames: np.ndarray, pictures: Sequence[np.ndarray], border: int = 0) -> None:
-    """Put pictures, (row, [look,] size, size, 3) a view, into (row, look * view * 3, size, size + 2 * border)."""
+    """Put pictures, (row, size, size, 3) a look and view, into (row, look * view * 3, size, size + 2 * border)."""
     inner = frames[..., border : border + frames.shape[2]]
-    for view, picture in enumerate(pictures):
-        looks = picture if picture.ndim == 5 else picture[:, None]
-        for look in range(looks.shape[1]):
-            first = 3 * (look * len(pictures) + view)
-            inner[:, first : first + 3] = looks[:, look].transpose(0, 3, 1, 2)
+    for place, picture in enumerate(pictures):
+        inner[:, 3 * place : 3 * place + 3] = picture.transpose(0, 3, 1, 2)
     if border:
         frames[..., :border], frames[..., -border:] = inner[..., :border][..., ::-1], inner[..., -border:][..., ::-1]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -169,11 +169,17 @@ class PaintedSubset(SubsetReader):
                 for first in range(0, len(missing), DRAWN_TOGETHER):
                     self._draw(missing[first : first + DRAWN_TOGETHER])
 
-    def painted(self, episode: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    def seen(self, pictures: Sequence[str], episodes: np.ndarray, rows: int) -> Iterator[list[np.ndarray]]:
+        for episode in episodes:
+            found = self.painted(int(episode), pictures, keep=not self.fresh)
+            yield [found[name][None] for name in pictures]
+
+    def painted(self, episode: int, arrays: Iterable[str] | None = None, keep: bool = True) -> dict[str, np.ndarray]:
         """Picture arrays of an episode by name, each (row, height, width, 3) uint8.
 
         Args:
           arrays: only these, all that can be painted by default.
+          keep: keep them while there is room.
 
         Raises:
           StoreError: there is no such episode here.
@@ -186,7 +192,7 @@ class PaintedSubset(SubsetReader):
             missing = [name for name in keys if name not in found]
             if missing:
                 found |= self._paint(episode, missing)
-            for name, key in keys.items():
+            for name, key in keys.items() if keep else ():
                 self._bytes += 0 if key in self._kept else found[name].nbytes
                 self._kept[key] = found[name]
                 self._kept.move_to_end(key)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -74,9 +74,18 @@ class PairedReader(SubsetReader):
         raise DmcvbError(f"{self.name} has labels for each setting: [part.labels(...) for part in subset.parts]")
 
     def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
-        views = [found[0] for name in pictures if (found := picture_of(name))]
         for part in self.parts:
-            part.prepare(episodes, _image(part, *views))
+            part.prepare(episodes, _image(part, *_views(pictures)))
+
+    def seen(self, pictures: Sequence[str], episodes: np.ndarray, rows: int) -> Iterator[list[np.ndarray]]:
+        names = [_image(part, *_views(pictures)) for part in self.parts]
+        for one in episodes[:, None]:
+            seen = (part.seen(shown, one, rows) for part, shown in zip(self.parts, names, strict=True))
+            yield [picture for found in seen for some in found for picture in some]
+
+
+def _views(pictures: Iterable[str]) -> list[str]:
+    return [found[0] for name in pictures if (found := picture_of(name))]
 
 
 def _image(part: SubsetReader, *views: str) -> tuple[str, ...]:
