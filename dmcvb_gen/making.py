@@ -141,7 +141,7 @@ def make(
       name: TASK/LEVEL/SETTING; a level may be a union ("medium-expert").
       episodes: Episodes, of each level. [default: those of `rollout`, or all of the release]
       release: Folder or URL of a release to read.
-      held_out: Share of the episodes that `val` has, one at least.
+      held_out: Share of the episodes that `val` has; both have one at least.
       seed: Random seed of the data, and of the choice of those episodes.
       environment: Options of `SubsetReader.environment`: stack, split, num_envs, ...
       options: Options of `rollout` for the data: size, max_steps, renderer, workers, ...
@@ -179,7 +179,7 @@ def make(
         order = np.random.default_rng(seed).permutation(subset.episodes[:episodes])
         if len(order) < 2:
             raise DmcvbError(f"{part} has {len(order)} episodes; give 2 or more, for train and val")
-        count = max(1, round(held_out * len(order)))
+        count = min(max(1, round(held_out * len(order))), len(order) - 1)
         train.append(subset.part(np.sort(order[count:])))
         val.append(subset.part(np.sort(order[:count])))
     learned, held = (one[0] if len(one) == 1 else UnionReader(opened, one) for one in (train, val))

@@ -90,10 +90,9 @@ class StoredArray:
         wanted, rest = episodes[order], (slice(rows),) * (self.ndim > 1)
         with storage_errors(self._place, decoding=True):
             runs = np.split(wanted, np.flatnonzero(np.diff(wanted) != 1) + 1)
-            if len(runs) == 1 or "height" in self.dimensions:
-                read = [self._array[(slice(int(run[0]), int(run[-1]) + 1), *rest)] for run in runs]
-            else:
-                read = [self._array.oindex[(wanted, *rest)]]
+            scattered = len(runs) > 1 and "height" not in self.dimensions
+            parts = [wanted] if scattered else [slice(int(run[0]), int(run[-1]) + 1) for run in runs]
+            read = [self._array.oindex[(part, *rest)] for part in parts]
             values = cast(np.ndarray, read[0] if len(read) == 1 else np.concatenate(read))
         return values if np.array_equal(wanted, episodes) else values[np.argsort(order)]
 
@@ -347,11 +346,11 @@ class Subset:
         return {name: value.reshape(-1, *value.shape[2:]) if used.all() else value[used] for name, value in read}
 
     def seen(self, pictures: Sequence[str], episodes: np.ndarray, rows: int) -> Iterator[list[np.ndarray]]:
-        """Pictures of episodes, some at a time, to look at only: in their order (episode, at least `rows`, ...).
+        """Pictures of one episode after another, to look at only: in their order (at least `rows`, ...).
 
         Of several looks, all pictures of one come before those of the next.
         """
-        yield [self._read(name, episodes, rows) for name in pictures]
+        yield from map(list, zip(*(self._read(name, episodes, rows) for name in pictures), strict=True))
 
     def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
         """The stored labels of the distractors, leading shape (episode, step); see `read`."""

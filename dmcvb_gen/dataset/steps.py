@@ -17,7 +17,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,9 +122,9 @@ class StepTable:
                 for name, found in part.subset.rows(FIELDS, chosen).items():
                     values[name].append(found)
                 if frames is not None:
-                    _fill_all(
-                        frames[row:], part.subset.seen(part.pictures, chosen, int(ends.max(initial=0))), ends, border
-                    )
+                    seen = part.subset.seen(part.pictures, chosen, int(ends.max(initial=0)))
+                    for last, end, pictures in zip(row + np.cumsum(ends), ends, seen, strict=True):
+                        _fill(frames[last - end : last], [picture[:end] for picture in pictures], border)
                 row += int(ends.sum())
                 tick(row / max(1, rows))
         fields = {name: np.concatenate(found) for name, found in values.items()}
@@ -178,13 +178,6 @@ class StepTable:
             frames = frames.reshape(len(rows), stack, self.looks, one, size, size).swapaxes(1, 2)
             values[f"{prefix}pixels"] = frames.reshape(len(rows), *looks, stack * one, size, size)
         return values
-
-
-def _fill_all(frames: np.ndarray, seen: Iterator[Sequence[np.ndarray]], ends: np.ndarray, border: int = 0) -> None:
-    """Put the pictures of whole episodes, see `Subset.seen`, one after the other; `ends` are their rows."""
-    episodes = (pictures for some in seen for pictures in zip(*some, strict=True))
-    for last, rows, pictures in zip(np.cumsum(ends), ends, episodes, strict=True):
-        _fill(frames[last - rows : last], [picture[:rows] for picture in pictures], border)
 
 
 def _fill(frames: np.ndarray, pictures: Sequence[np.ndarray], border: int = 0) -> None:

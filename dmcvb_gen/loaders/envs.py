@@ -20,11 +20,10 @@ from numpy.typing import ArrayLike
 
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.distractor_state import DistractorState
-from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
+from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.modalities import get_modality
-from dmcvb_gen.generate.render import check_renderer, look
-from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.generate.render import check_renderer, look, open_renderer
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
@@ -105,7 +104,7 @@ class Scene:
             unused += ["fixed_goals", "goal_pair", "goal_seed"]
         elif self.goal_pair is not None and self.goal_pair >= self.fixed_goals != FIXED_GOALS:
             raise DmcvbError(f"goal_pair is {self.goal_pair}; give 0 to {self.fixed_goals - 1}, as fixed_goals says")
-        if spec.distractor.kind == "none":
+        if not spec.distractor.shows_videos:
             unused.append("backgrounds")
         for name in unused:
             if getattr(self, name) != getattr(Scene, name):
@@ -151,15 +150,8 @@ class _Stage:
         self._first_pair = scene.goal_pair or 0
         check_size(scene.size)
         check_renderer(scene.renderer)
-        self.backgrounds = None if self.setting.kind == "none" else load_backgrounds(scene.backgrounds, scene.split)
-        self.renderer = make_renderer(
-            scene.renderer,
-            self.task,
-            scene.size,
-            backgrounds=self.backgrounds,
-            floor_alpha=floor_alpha_for(self.task, self.setting),
-            samples=scene.samples,
-        )
+        given = (scene.renderer, scene.size, scene.samples, scene.backgrounds, scene.split)
+        self.renderer, self.backgrounds = open_renderer(self.task, self.setting, *given)
         self.batch = self.task.batch(count, scene.threads)
         self._episodes = [(0, 0)] * count  # (seed, number) of each place
         self.frame, self.started = np.zeros(count, int), np.zeros(count, int)

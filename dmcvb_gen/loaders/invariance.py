@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +11,15 @@ import numpy as np
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.paired import PairedReader
+from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks.cameras import nominal_cameras
 
 ENCODED = 64
 """Images that an encoder gets at a time."""
 RIDGE = 1e-3
 """Weight of the squared coefficients of a probe, a sample."""
+SAME = 1e-5
+"""How far labels of the same state may differ by rounding."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,8 @@ class Invariance:
         state: 1 for an encoder that sees nothing but the state.
       chance: `retrieval` of an encoder that sees nothing.
       state: R2 of a linear probe of the state on episodes that it did not learn from; 1 is perfect, 0 or less nothing.
-      distractors: R2 of a linear probe of the distractors' real-valued labels; NaN if they never differ.
+      distractors: R2 of a linear probe of the distractors' real-valued labels that differ between the looks of a state,
+        the camera's as seen from the model's own camera; NaN if none does.
     """
 
     retrieval: float
@@ -54,10 +59,15 @@ def evaluate_invariance(
     source = pairs.source(episodes=chosen, in_memory=True, **options)
     batch = source.gather(sorted(rng.permutation(len(source))[:states].tolist()))
     count, tested = len(batch["step"]), np.isin(batch["episode"], chosen[1::2])
+    if tested.all() or not tested.any():
+        raise DmcvbError(f"{states} states are of one half of the episodes alone; ask for more")
     features = [_encoded(encoder, batch["pixels"][:, look]) for look in range(pairs.looks)]
     scaled = np.split(_scaled(np.concatenate(features)), pairs.looks)
     places = np.searchsorted(chosen, batch["episode"]), batch["step"]
-    labels = _real([part.labels(chosen)[places] for part in pairs.parts])
+    position, turn = nominal_cameras(get_task(pairs.task), pairs.read("physics", chosen)[places])
+    follows = {"camera_position": position, "camera_quaternion": turn}  # the agent: where it is, is state
+    labels = _real([part.labels(chosen)[places] for part in pairs.parts], follows)
+    labels = labels[:, np.ptp(labels.reshape(pairs.looks, count, -1), axis=0).max(axis=0, initial=0) > SAME]
     everywhere, looks = np.concatenate(scaled), np.tile(tested, pairs.looks)
     return Invariance(
         float(np.mean([_found(one, other) for one in scaled for other in scaled if one is not other])),
@@ -81,11 +91,18 @@ def _scaled(values: np.ndarray) -> np.ndarray:
     return (values[:, varies] - values[:, varies].mean(axis=0)) / std[varies]
 
 
-def _real(looks: Sequence[DistractorState]) -> np.ndarray:
-    """(look * image, label) of the labels that are real numbers; one that a look does not vary is zero in it."""
+def _real(looks: Sequence[DistractorState], state: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(look * image, label) of the labels that are real numbers; one that a look does not vary is zero in it.
+
+    Args:
+      state: what of a label is the state's own.
+    """
     labels = [dict(look.items()) for look in looks]
     real = {name: value for look in labels for name, value in look.items() if value.dtype.kind == "f"}
-    found = [np.concatenate([look.get(name, np.zeros_like(value)) for look in labels]) for name, value in real.items()]
+    found = [
+        np.concatenate([look.get(name, np.zeros_like(value)) - state.get(name, 0) for look in labels])
+        for name, value in real.items()
+    ]
     return np.concatenate([value.reshape(len(value), -1) for value in found], axis=1).astype(float)
 
 

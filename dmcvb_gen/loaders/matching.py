@@ -19,6 +19,8 @@ def matching_environment(
     given = environment_options(subset, split) | {"stack": stack}
     if (videos := shown_videos(subset)) != BUILTIN:
         given["backgrounds"] = videos
+    if repeat := options.get("action_repeat"):  # the data's time limit, in other steps
+        given["max_steps"] = given["max_steps"] * subset.record.action_repeat // repeat
     given |= options
     return DistractedEnv(**given) if num_envs is None else DistractedVectorEnv(num_envs, **given)
 

@@ -172,7 +172,7 @@ class PaintedSubset(SubsetReader):
     def seen(self, pictures: Sequence[str], episodes: np.ndarray, rows: int) -> Iterator[list[np.ndarray]]:
         for episode in episodes:
             found = self.painted(int(episode), pictures, keep=not self.fresh)
-            yield [found[name][None] for name in pictures]
+            yield [found[name] for name in pictures]
 
     def painted(self, episode: int, arrays: Iterable[str] | None = None, keep: bool = True) -> dict[str, np.ndarray]:
         """Picture arrays of an episode by name, each (row, height, width, 3) uint8.

@@ -78,10 +78,9 @@ class PairedReader(SubsetReader):
             part.prepare(episodes, _image(part, *_views(pictures)))
 
     def seen(self, pictures: Sequence[str], episodes: np.ndarray, rows: int) -> Iterator[list[np.ndarray]]:
-        names = [_image(part, *_views(pictures)) for part in self.parts]
-        for one in episodes[:, None]:
-            seen = (part.seen(shown, one, rows) for part, shown in zip(self.parts, names, strict=True))
-            yield [picture for found in seen for some in found for picture in some]
+        looks = (part.seen(_image(part, *_views(pictures)), episodes, rows) for part in self.parts)
+        for episode in zip(*looks, strict=True):
+            yield [picture for look in episode for picture in look]
 
 
 def _views(pictures: Iterable[str]) -> list[str]:

@@ -95,7 +95,7 @@ class SubsetReader(Subset):
         if kind not in kinds:
             raise UnknownNameError("kind of data set", kind, kinds)
         made, takes = kinds[kind]
-        known = [name for name in inspect.signature(takes).parameters if name != "subset"]
+        known = [name for name in inspect.signature(takes).parameters if name not in ("subset", "worker", "workers")]
         if unknown := options.keys() - known:
             raise UnknownNameError(f"option of torch({kind!r})", min(unknown), known)
         if kind == "transitions":

@@ -6,14 +6,14 @@ Episodes are numbered through: those of the second part come after all episodes 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
-from typing import Any, NoReturn
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NoReturn, Self
 
 import numpy as np
 
 from dmcvb_gen.dataset.gate import Release, Shard
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.loaders.arrays import JoinedArray
+from dmcvb_gen.loaders.arrays import ComputedArray, JoinedArray
 from dmcvb_gen.loaders.release import SubsetReader
 
 ALIKE = ("task", "setting", "size", "views", "hidden_goal", "max_steps", "action_repeat", "renderer", "backgrounds")
@@ -28,6 +28,8 @@ class UnionReader(SubsetReader):
     """
 
     def __init__(self, release: Release, parts: Sequence[SubsetReader]):
+        if len(parts) < 2:
+            raise DmcvbError(f"{len(parts)} subsets are given; name two or more")
         records = [part.record for part in parts]
         for field in ALIKE:
             for record in records[1:]:
@@ -55,8 +57,28 @@ class UnionReader(SubsetReader):
     def arrays(self) -> tuple[str, ...]:
         return tuple(sorted(set.intersection(*(set(part.arrays) for part in self.parts))))
 
+    def part(self, episodes: Iterable[int]) -> Self:
+        chosen = super().part(episodes)
+        places = np.searchsorted(self._starts, chosen.episodes, "right") - 1
+        own = chosen.episodes - self._starts[places]
+        chosen.parts = tuple(part.part(own[places == place]) for place, part in enumerate(self.parts))
+        return chosen
+
     def array(self, name: str) -> Any:
+        if name == "behaviour":  # counts the policies of all parts; -1 for random actions
+            return ComputedArray(name, (self.record.episodes,), np.dtype(np.int16), ("episode",), self._behaviour)
         return JoinedArray([part.array(name) for part in self.parts], self._starts)
+
+    def _behaviour(self, episode: int, _: tuple) -> np.ndarray:
+        place = int(np.searchsorted(self._starts, episode, "right")) - 1
+        before = sum(len(part.record.policies) for part in self.parts[:place])
+        own = self.parts[place].array("behaviour")[episode - int(self._starts[place])] + before
+        return own if self.parts[place].record.policies else np.full_like(own, -1)
+
+    @property
+    def unpainted(self) -> np.ndarray:
+        """(episode of the union,) bool: episodes without images."""
+        return np.concatenate([part.unpainted for part in self.parts])
 
     @functools.cached_property
     def _episodes(self) -> np.ndarray:

@@ -30,6 +30,8 @@ def test_one_call_gives_data_and_their_environment_and_makes_them_once(name, tmp
     [folder] = (tmp_path / "dmcvb-gen/made").iterdir()
     digest = Release.open(folder).digest
     again = dmcvb_gen.make(name, episodes=5, **SHORT)
+    most = dmcvb_gen.make(name.removesuffix("_medium"), episodes=5, release=folder, held_out=0.95)
+    assert (len(most.train), len(most.val)) == (levels, 4 * levels)
     assert [*again.train.episodes] == [*train.episodes] and Release.open(folder).digest == digest
     for asked, count in ((22, 22), (None, 20)):
         grown = dmcvb_gen.make(name, episodes=asked, **SHORT)
@@ -55,6 +57,8 @@ def test_a_policy_is_scored_as_its_data_are_and_normalized_by_them(levels):
     assert score.normalized == pytest.approx(100 * (score.mean - low) / (high - low))
     for other in ({"max_steps": 3}, {"action_repeat": 4}):
         assert release[expert].evaluate(still, episodes=1, pixels=False, **other).normalized is None
+    assert release[expert].evaluate(still, episodes=1, pixels=False, action_repeat=4).limit == 3  # the data's time
+    assert release[expert].environment(action_repeat=1).unwrapped._stage.max_steps == 12
     told = {subset["name"]: subset["normalized"] for subset in describe_release(folder)["subsets"]}
     assert (told[random], told[expert]) == pytest.approx((0, 100))
 

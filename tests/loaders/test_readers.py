@@ -221,7 +221,7 @@ def test_wrong_names_are_answered_with_the_right_ones(subset, tmp_path):
             subset.release[other]
     with pytest.raises(UnknownNameError, match="transitions"):
         subset.torch("rows")
-    for kind, option in (("steps", "batch_size"), ("stream", "in_memory")):
+    for kind, option in (("steps", "batch_size"), ("stream", "in_memory"), ("stream", "workers")):
         with pytest.raises(UnknownNameError, match=f"unknown option of torch\\('{kind}'\\) '{option}'"):
             subset.torch(kind, **{option: 4})
     with pytest.raises(UnknownNameError, match="pixels"):

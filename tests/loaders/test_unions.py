@@ -48,10 +48,12 @@ def test_every_form_gives_the_steps_of_both_parts(levels):
     release = Release.open(folder)
     for episode, (name, own) in enumerate([*((parts[0], e) for e in range(3)), *((parts[1], e) for e in range(2))]):
         one, other = union.episode(episode), release[name].episode(own)
+        assert (one.pop("behaviour"), other.pop("behaviour")) == (-1 if name == parts[0] else 0, 0)
         assert one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
         np.testing.assert_array_equal(union.array("state")[episode, 2:4], other["state"][2:4])
         np.testing.assert_array_equal(union.xarray([episode, 0])["physics"][0, : len(one["physics"])], one["physics"])
     np.testing.assert_array_equal(union.array("state")[[4, 0]], union.read("state", [4, 0]))
+    assert not union.unpainted.any() and [list(part.episodes) for part in union.part([4, 1]).parts] == [[1], [1]]
     assert union.bytes == sum(dmcvb_gen.open(folder)[name].bytes for name in parts)
 
 
@@ -94,5 +96,7 @@ def test_subsets_of_other_settings_and_unknown_levels_are_no_union(levels):
         release.union(parts[0], parts[1].replace(other[1], other[0]))
     with pytest.raises(UnknownNameError, match="unknown subset"):
         release[parts[0].replace("random", "medium-expert")]
+    with pytest.raises(DmcvbError, match="1 subsets are given; name two or more"):
+        release.union(parts[0])
     with pytest.raises(DmcvbError, match="is a union; pair its parts"):
         release.union(*parts).paired(*other)

@@ -16,7 +16,7 @@ class Depth(Modality):
 
     name, bounds = "depth", (0, np.inf)
     encoding = f"grey level = 255 / (1 + meters / {SCALE}), 0: sky"
-    levels = "16-bit level = millimeters, 0: sky"
+    levels = "16-bit level = millimeters, 0: sky, 65535: or farther"
 
     def gray(self, values):
         return np.rint(values * 1000).clip(0, np.iinfo(np.uint16).max).astype(np.uint16)

@@ -28,7 +28,7 @@ class Flow(Modality):
     """
 
     name, shape, needs_next = "flow", (2,), True
-    encoding = f"R = 128 + {round(1 / STEP)} pixels to the right, G = 128 + {round(1 / STEP)} pixels down, B = 128"
+    encoding = f"R = 128 + {round(1 / STEP)} pixels to the right, G = 128 + {round(1 / STEP)} down; 0, 255: or farther"
 
     def compute(self, seen):
         task, column = seen.task, seen.task.views.index(seen.view)
