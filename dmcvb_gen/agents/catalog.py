@@ -101,7 +101,6 @@ def parse_agent(name: str) -> Agent:
     """
     known = agent_names()
     base, _, options = name.strip().lower().partition(":")
-    base = {"bc(state)": "state-bc", "td3-bc(state)": "state-td3-bc"}.get(base, base).removeprefix("null+")
     if base not in known:
         raise UnknownNameError("agent", name, known)
     if base.startswith("state-"):

@@ -274,7 +274,8 @@ class TrainingData:
             rows = rows[rows + k <= self.end[rows]]
         if not len(rows):
             kind = "held-out " if hold_out else ""
-            raise DmcvbError(f"there are no {kind}transitions to draw from (k = {k}); roll out more episodes")
+            cure = "roll out more episodes" if k == 1 else f"roll out episodes of more than {k} steps"
+            raise DmcvbError(f"there are no {kind}transitions to draw from (k = {k}); {cure}")
         index = generator.integers(len(rows), size=size)
         offsets = steps = None
         if shift and not hold_out and self.frames is not None and self.latent is None:

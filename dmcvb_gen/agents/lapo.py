@@ -5,9 +5,9 @@ image of the first one and of these codes (section 4.1). A latent policy predict
 (section 4.2); it is what is kept. "lapo+bc" decodes its latent actions into true ones (section 4.3) by all labeled
 trajectories that it is given.
 
-What differs from the paper, whose code is for Procgen: the networks are those of DMC-VB's agents; the forward model
-adds its image to the newest frame, in place of a U-Net's connections; all of it is trained in one training, in place of
-one after the other.
+What differs from the paper, whose code is for Procgen: the networks are those of DMC-VB's agents; there is one codebook
+in place of two; the forward model adds its image to the newest frame, in place of a U-Net's connections; all of it is
+trained in one training, in place of one after the other.
 """
 
 from __future__ import annotations
@@ -48,6 +48,8 @@ class LatentActionPolicy(LatentActions):
 
     No gradient of the second term reaches f.
     """
+
+    shifts = False
 
     def __init__(self, encoder: Encoder, sizes: Sizes, architecture: Architecture = PAPER):
         super().__init__(encoder, sizes, architecture)

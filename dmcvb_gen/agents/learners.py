@@ -91,6 +91,8 @@ class Learner(nn.Module, abc.ABC):
 
     draws: Mapping[str, Any] = {}
     """How its batches are drawn: next_observation, k, sample_k, later and pictures of `TrainingData.batch`."""
+    shifts = True
+    """Whether it learns from pictures that are shifted at random, where the budget shifts them."""
     needs_labels = False
     """Whether batches need `labeled`: it pre-trains an encoder with the actions of the policy's episodes alone."""
     compiled = ("losses",)

@@ -124,7 +124,8 @@ def draw(
     batch = data.batch(size, generator, hold_out=hold_out, reuse=reuse, **learner.draws, **common)
     if not learner.needs_labels or hold_out:
         return batch
-    return replace(batch, labeled=data.labeled().batch(size, generator, next_observation=True, **common))
+    common |= {"next_observation": True} | learner.draws
+    return replace(batch, labeled=data.labeled().batch(size, generator, **common))
 
 
 def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) -> dict[str, float]:
@@ -183,7 +184,8 @@ def train(
     rates = [group["lr"] * (budget.rate if pixels else 1.0) for group in groups]
     workers = 2 if pixels and data.frames.mapped else int(data.device.type != "cpu")
     for step, batch in batches(make, steps, workers):
-        torch.manual_seed((budget.seed << 32) + step)
+        # A generator of torch's takes 32 bits of what it is given.
+        torch.manual_seed(int(np.random.SeedSequence((budget.seed, step)).generate_state(1)[0]))
         for group, rate in zip(groups, rates, strict=True):
             group["lr"] = rate * (1 - step / steps) if budget.decay else rate
         for name, value in learner.update(batch).items():

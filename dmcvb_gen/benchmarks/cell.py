@@ -17,6 +17,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import math
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -48,11 +49,11 @@ from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, ignore, open_pool
-from dmcvb_gen.policies.evaluation import goal_speed
+from dmcvb_gen.policies.evaluation import goal_scores
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.version import __version__
 
-RESULT_VERSION = 7
+RESULT_VERSION = 8
 PAPER_SIZE = 64
 """Pixels a side of the paper's images."""
 INSPECTED = 150_000
@@ -238,7 +239,8 @@ class CellRun:
         encoder = make_encoder(agent, data.sizes, architecture=budget.network)
         learner = make_pretrainer(agent, encoder, data.sizes, budget.network).to(budget.device)
         steps, label = budget.pixel_steps, f"{agent.pretrain} encoder of {self.cell.task}"
-        curve = self._fit(learner, data, steps, budget.shifts(steps, len(data)), label)
+        shift = learner.shifts and budget.shifts(steps, len(data))
+        curve = self._fit(learner, data, steps, shift, label)
         with replacing(self.path(".safetensors")) as path:
             save_file({name: value.cpu().contiguous() for name, value in encoder.state_dict().items()}, str(path))
         probe = action_probe(learner, data) if hasattr(learner, "latent_action") else None
@@ -260,8 +262,6 @@ class CellRun:
             cell.agent, data.sizes, policy, data.normalization, evaluation_of(self.release, budget, cell)
         )
         curve = self._train_policy(policy, trained, data)
-        if self._keeps_weights:
-            trained.save(self.path(".safetensors"), budget.network)
         inspection = self.inspect(policy.encoder, data) if pixels and budget.readout_steps else None
         return self._facts(data, curve) | {
             "pretraining": pretrained and {key: pretrained[key] for key in ("curve", "seconds", "action_probe")},
@@ -286,9 +286,14 @@ class CellRun:
             threads=budget.threads,
         )
         with contextlib.closing(evaluator):
+            best = -math.inf
 
             def evaluate(_: Learner) -> dict[str, Any]:
+                nonlocal best
                 score = evaluator.score(trained)
+                if self._keeps_weights and score.mean > best:  # the policy whose score counts
+                    trained.save(self.path(".safetensors"), budget.network)
+                best = max(best, score.mean)
                 if score.pictures is not None:
                     _save_sheet(self.path(".rollout.png"), [score.pictures])
                 return {"score": score.facts()}
@@ -383,16 +388,10 @@ def _load_encoder(path: Path, encoder: nn.Module) -> None:
 def data_score(subset: Subset, data: TrainingData) -> Score:
     """The score of training data, in the measures that policies are scored in."""
     task = get_task(subset.task).at(subset.record.action_repeat)
-    success = speed = None
-    part = task.state_slices.get("target_vector")
-    if part is not None:
-        ends = np.cumsum(data.lengths + 1) - 1
-        first = torch.as_tensor(ends - data.lengths, device=data.device)
-        normal = data.normalization
-        to_goal = data.state[first][:, part].cpu() * normal.std[part].cpu() + normal.mean[part].cpu()
-        distance = to_goal.norm(dim=1).numpy()
-        reached = (data.discount[torch.as_tensor(ends - 1, device=data.device)] == 0).cpu().numpy()
-        success, speed = float(reached.mean()), goal_speed(distance, data.lengths, reached, task)
+    ends, normal = np.cumsum(data.lengths + 1) - 1, data.normalization
+    start = (data.state[ends - data.lengths] * normal.std + normal.mean).cpu().numpy()
+    reached = (data.discount[ends - 1] == 0).cpu().numpy()
+    success, speed = goal_scores(task, start, data.lengths, reached)
     return Score.of(data.returns, success=success, speed=speed, limit=subset.record.max_steps)
 
 
@@ -446,7 +445,11 @@ def run_cells(
     if budget.device == "cpu":
         needs = Needs(cpus=budget.threads, memory=budget.memory)
     kept = "finished cells are kept: rerun the same command"
-    with open_pool(workers, threads=budget.threads, tick=tick, kept=kept, needs=needs) as pool:
+    with (
+        open_pool(workers, threads=budget.threads, tick=tick, kept=kept, needs=needs) as pool,
+        contextlib.ExitStack() as after,
+    ):
+        after.callback(_held.clear)  # pictures that this process held
         share = pool.memory_each()
         if budget.memory is None and share is not None and budget.device == "cpu":
             budget = dataclasses.replace(budget, memory=share // 2)  # pictures take half, as they do if one is alone

@@ -24,16 +24,15 @@ import numpy as np
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.manifest import MAX_STEPS
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
-from dmcvb_gen.distractors import DistractorSampler, floor_alpha_for, load_backgrounds
+from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing
-from dmcvb_gen.generate.inputs import shown_videos
+from dmcvb_gen.generate.inputs import BUILTIN, shown_videos
 from dmcvb_gen.generate.recipe import NATIVE
 from dmcvb_gen.generate.references import normalized, reference_returns
+from dmcvb_gen.generate.render import open_renderer
 from dmcvb_gen.options import Count, Seed, Split, checked
-from dmcvb_gen.policies.evaluation import goal_speed
-from dmcvb_gen.rendering import make_renderer
-from dmcvb_gen.rendering.base import check_size
+from dmcvb_gen.policies.evaluation import goal_scores
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import LEVELS, GoalMode, SubsetSpec, parse_setting, task_folder
 from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
@@ -70,7 +69,7 @@ class Score:
         and NaN of one episode.
       returns: return of each episode.
       success: share of the episodes that the task ended (mazes), else None.
-      speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_speed`).
+      speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_scores`).
       limit: agent steps after which an episode was cut.
       normalized: the mean, 0 for random actions and 100 for the data's expert; None where one of them is unknown.
       pictures: (frame, size, size, 3) uint8, the first episode at even intervals; None for agents that see states.
@@ -156,12 +155,9 @@ class EvaluationScene:
         if level in LEVELS:
             raise DmcvbError(f"{where!r} names a subset; an evaluation has no level: give {head}/{setting}")
         spec = SubsetSpec.parse(task, "random", setting)
-        if options.get("backgrounds", cls.backgrounds) != cls.backgrounds and spec.distractor.kind == "none":
-            raise DmcvbError(f"{where} shows no videos, so backgrounds have no effect: leave them out")
         if spec.goal is GoalMode.FIXED:
             raise DmcvbError(f"{where}: goals are fixed by a release's episodes; use `validate --benchmark b3`")
         views = [view for view in get_task(task).views if view not in NOT_TRAINED_ON]
-        check_size(options.get("size", cls.size))
         return cls(task, spec.setting, Pictures(tuple(views), spec.hides_goal), **options)
 
 
@@ -202,16 +198,8 @@ class Evaluator:
         self.steps = evaluation_steps(self.task, max_steps)
         self.stack, self.pair, self.renderer, self.videos = stack, pair, None, None
         if pixels:
-            if self.setting.kind != "none":
-                self.videos = load_backgrounds(scene.backgrounds, scene.split)
-            self.renderer = make_renderer(
-                scene.renderer,
-                self.task,
-                scene.size,
-                backgrounds=self.videos,
-                floor_alpha=floor_alpha_for(self.task, self.setting),
-                samples=scene.samples,
-            )
+            look = (scene.renderer, scene.size, scene.samples)
+            self.renderer, self.videos = open_renderer(self.task, self.setting, *look, scene.backgrounds, scene.split)
 
     def close(self) -> None:
         """Free the renderer."""
@@ -233,8 +221,7 @@ class Evaluator:
         batch = task.batch(count, self.threads)
         starts = self.streams("initial_state")
         state = batch.reset(starts) if self.pair is None else batch.reset_fixed(starts, [self.pair] * count)
-        goal = task.state_slices.get("target_vector")
-        distance = None if goal is None else np.linalg.norm(state[:, goal], axis=1)  # meters, in a straight line
+        start = state.copy()
         walk, stack, pictures, action = self._walk(), None, [], None
         returns, length = np.zeros(count), np.full(count, self.steps)
         active, ended = np.ones(count, bool), np.zeros(count, bool)
@@ -257,10 +244,11 @@ class Evaluator:
             active &= ~over
             if not active.any():
                 break
+        success, speed = goal_scores(task, start, length, ended)
         return Score.of(
             returns,
-            success=None if distance is None else float(ended.mean()),
-            speed=None if distance is None else goal_speed(distance, length, ended, task),
+            success=success,
+            speed=speed,
             limit=self.steps,
             pictures=np.stack(pictures) if pictures else None,
         )
@@ -326,7 +314,7 @@ def evaluate(
     size: int | None = None,
     renderer: str | None = None,
     samples: int | None = None,
-    backgrounds: str = "builtin",
+    backgrounds: str | None = None,
     split: Split = SPLIT,
     action_repeat: Literal[1, 2, 4] | None = None,
     max_steps: Count | None = None,
@@ -351,7 +339,7 @@ def evaluate(
       pixels: give pictures, by default yes; without them an evaluation takes seconds.
       size: pixels a side, by default 64. renderer: its name. samples: anti-aliasing samples of a pixel. Both are by
         default those of the data that a `load_agent` policy learned from, or the package's.
-      backgrounds: "builtin" or a folder of videos.
+      backgrounds: "builtin" or a folder of videos, by default the subset's own or else the built-in ones.
       split: videos and maze styles to show: "val", as `validate` does, or "train", those of the data. The difference of
         the two scores is what a policy loses on distractors that it has not seen.
       action_repeat: control steps for which an action is held, by default those of a `load_agent` policy's data, or 2.
@@ -364,20 +352,28 @@ def evaluate(
       DmcvbError: no such task, setting or split, or actions that have another shape, are no numbers or leave their
         bounds, or observations or actions of another kind or size than the policy's.
     """
-    stack, pixels = _own_value(policy, "stack", stack, 3), _own_value(policy, "pixels", pixels, True)
+    pixels = _own_value(policy, "pixels", pixels, True)
+    shown: dict[str, Any] = dict(stack=stack, size=size, renderer=renderer, samples=samples, backgrounds=backgrounds)
+    for name, value in shown.items():
+        if value is not None and not pixels:
+            raise DmcvbError(f"{name} has no effect without pictures; leave it out")
+    stack = _own_value(policy, "stack", stack, 3)
     seen = getattr(policy, "evaluation", None) or {}
     if isinstance(where, Subset):
         if where.record.goal_mode is GoalMode.FIXED:
             raise DmcvbError(f"{where.name} has fixed goals; score policies on them by `validate --benchmark b3`")
-        scene = EvaluationScene.of(where, None if backgrounds == EvaluationScene.backgrounds else backgrounds)
+        scene = EvaluationScene.of(where, backgrounds)
         _own_value(policy, "picture_size", scene.size if pixels and size is None else size, 0)
-        max_steps = min(max_steps or MAX_STEPS, where.record.max_steps)
+        longest = where.record.max_steps * where.record.action_repeat // (action_repeat or where.record.action_repeat)
+        max_steps = min(max_steps or MAX_STEPS, longest)
     else:
         drawn = seen.get("renderer") or {"name": NATIVE, "samples": None}
         size = _own_value(policy, "picture_size", size, 64) if pixels else 64
         repeat = seen.get("action_repeat", ACTION_REPEAT)
-        shown: dict[str, Any] = dict(renderer=drawn["name"], samples=drawn["samples"], action_repeat=repeat)
-        scene = EvaluationScene.parse(where, backgrounds=backgrounds, size=size, **shown)
+        shown = dict(renderer=drawn["name"], samples=drawn["samples"], action_repeat=repeat)
+        scene = EvaluationScene.parse(where, backgrounds=backgrounds or BUILTIN, size=size, **shown)
+    if backgrounds is not None and not parse_setting(scene.task, scene.setting)[0].shows_videos:
+        raise DmcvbError(f"{scene.task}/{scene.setting} shows no videos, so backgrounds have no effect: leave them out")
     if renderer not in (None, scene.renderer):
         scene = replace(scene, renderer=renderer, samples=None)
     given = dict(size=size, samples=samples, action_repeat=action_repeat, split=split)

@@ -141,6 +141,8 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
       DmcvbError: the folder cannot be made or written, or holds results of another release or budget.
     """
     folder = local_path(out)
+    if release.store.folder and folder.resolve().is_relative_to(release.store.folder.resolve()):
+        raise DmcvbError(f"{folder} lies in the release, which never changes; choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -409,7 +411,7 @@ def _score_lines(result: Mapping[str, Any], budget: Mapping[str, Any]) -> list[s
     lines += _goal_lines(score)
     if result["labels"]["encoder"]:
         lines.append(f"encoder: {result['labels']['encoder']}")
-    if (result["pretraining"] or {}).get("action_probe") is not None:
+    if budget["scores"] and (result["pretraining"] or {}).get("action_probe") is not None:
         lines.append(f"probe misses {100 * result['pretraining']['action_probe']:.0f} % of the actions' variance")
     return lines
 

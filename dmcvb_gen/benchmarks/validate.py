@@ -98,7 +98,7 @@ def validate(
     chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
     if patterns:  # a subset that was not asked for is not missing
         missing = [one for one in missing if any(matches(name, patterns) for name in one.subsets)]
-    folder = local_path(out or Path("reports") / Path(release).name)
+    folder = local_path(out or Path("reports") / Path(release).resolve().name)
     claim_folder(folder, data, budget, training=bool(cells))
     results = []
     with progress_bar(progress, " checks", "structure", scaled=False) as bar:

@@ -92,13 +92,12 @@ class Backgrounds:
         return self._decoded[video]
 
 
-def load_backgrounds(source: str | Path = "builtin", split: str = "train", videos: int | None = None) -> Backgrounds:
+def load_backgrounds(source: str | Path = "builtin", split: str = "train") -> Backgrounds:
     """The background videos of a source. Opened again with its files unchanged, a source costs nothing.
 
     Args:
       source: "builtin" or a folder.
       split: "train" or "val".
-      videos: take only the first so many (what `DistractorSetting.videos` has in play); None: all.
 
     Raises:
       BackgroundError: no such folder, nothing in it, or a video that cannot be read or is cut short (named).
@@ -107,7 +106,7 @@ def load_backgrounds(source: str | Path = "builtin", split: str = "train", video
     if not root.is_dir():
         raise BackgroundError(f"backgrounds {str(source)!r} are no folder; give a folder of videos, or 'builtin'")
     try:
-        found = _find_split(root, split)[:videos]
+        found = _find_split(root, split)
         stamps = tuple((p.stat().st_mtime_ns, p.stat().st_size) for _, files in found for p in files)
     except OSError as error:
         raise BackgroundError(f"cannot read background folder {root} ({error.strerror or error})") from None
@@ -247,10 +246,7 @@ def _read_video(path: Path) -> np.ndarray:
 
 def square(picture: Image.Image) -> np.ndarray:
     """The central square of a picture at FRAME_SIZE, (256, 256, 3) uint8."""
-    width, height = picture.size
-    side = min(width, height)
-    left, top = (width - side) // 2, (height - side) // 2
-    if (width, height) == (FRAME_SIZE, FRAME_SIZE):
-        return np.asarray(picture)
+    side = min(picture.size)
+    left, top = ((whole - side) // 2 for whole in picture.size)
     middle = picture.crop((left, top, left + side, top + side))
     return np.asarray(middle.resize((FRAME_SIZE, FRAME_SIZE), Image.Resampling.LANCZOS))

@@ -21,6 +21,7 @@ from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import make_renderer, renderer_class
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.spec import DistractorSetting
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -40,18 +41,23 @@ def check_renderer(name: str) -> None:
         raise RenderingError(f"renderer {name!r} cannot start here: {reason}")
 
 
-def renderer_for(record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]:
-    """The renderer of a subset, and its videos (None if its distractor shows none).
+def open_renderer(
+    task: Task, setting: DistractorSetting, name: str, size: int, samples: Any, backgrounds: str, split: str
+) -> tuple[Renderer, Any]:
+    """A renderer of a task under a distractor, and its videos (None without distractors).
 
     Args:
       backgrounds: "builtin" or a folder of videos.
     """
-    task, videos = get_task(record.task), videos_of(record, backgrounds)
-    look: dict[str, Any] = {
-        "floor_alpha": floor_alpha_for(task, record.distractor),
-        "samples": record.renderer.get("samples"),
-    }
-    return make_renderer(str(record.renderer["name"]), task, record.size, backgrounds=videos, **look), videos
+    videos = None if setting.kind == "none" else load_backgrounds(backgrounds, split)
+    look: dict[str, Any] = {"floor_alpha": floor_alpha_for(task, setting), "samples": samples}
+    return make_renderer(name, task, size, backgrounds=videos, **look), videos
+
+
+def renderer_for(record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]:
+    """The renderer of a subset, and its videos, see `open_renderer`."""
+    look = (str(record.renderer["name"]), record.size, record.renderer.get("samples"))
+    return open_renderer(get_task(record.task), record.distractor, *look, backgrounds, record.split)
 
 
 def videos_of(record: SubsetRecord, backgrounds: str) -> Backgrounds | None:

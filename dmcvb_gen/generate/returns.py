@@ -45,7 +45,7 @@ def evaluate_behaviour(
     from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.archives import bundled_digests
     from dmcvb_gen.policies.bundled import bundled_levels
-    from dmcvb_gen.policies.evaluation import maze_scores
+    from dmcvb_gen.policies.evaluation import goal_scores
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.policies.simulate import simulate
     from dmcvb_gen.tasks import get_task, typed_task
@@ -65,7 +65,7 @@ def evaluate_behaviour(
             own = is_own(behaviour or "") and level != "random"
             mode = "own" if own else "sampled" if sample or level == "random" else "mean"  # random actions are drawn
             row |= dict(mode=mode, behaviour=behaviour if own else None, returns=return_statistics(out.returns))
-            success, speed = maze_scores(task, out)
+            success, speed = goal_scores(task, out.state[:, 0], out.length, out.terminated)
             if success is not None:
                 row |= dict(success=success, speed=speed)
             rows.append(row | dict(paper=paper_returns(task_id, level)))

@@ -36,7 +36,7 @@ def evaluate(
     )
     returns = out.returns
     lowest, lower, middle, upper, highest = map(float, np.quantile(returns, (0, 0.25, 0.5, 0.75, 1)))
-    success, speed = maze_scores(task, out)
+    success, speed = goal_scores(task, out.state[:, 0], out.length, out.terminated)
     return (
         Evaluation(
             mean=float(returns.mean()),
@@ -52,22 +52,20 @@ def evaluate(
     )
 
 
-def goal_speed(distance: np.ndarray, length: np.ndarray, reached: np.ndarray, task: Task) -> float | None:
-    """Mean speed towards the goal of the episodes that reached it, m/s; None if none did.
+def goal_scores(
+    task: Task, start: np.ndarray, length: np.ndarray, reached: np.ndarray
+) -> tuple[float | None, float | None]:
+    """Share of episodes that reached the goal, and their mean speed towards it; None of a task without a goal.
 
     Args:
-      distance: (episode,) to the goal at the start in a straight line, meters.
+      start: (episode, state) of the first step.
       length: (episode,) agent steps. reached: (episode,) bool.
+
+    Returns:
+      The speed is of the straight line from the start to the goal, m/s; None if no episode reached it.
     """
-    seconds = length * task.seconds_per_step
-    return float((distance / seconds)[reached].mean()) if reached.any() else None
-
-
-def maze_scores(task: Task, simulation: Simulation) -> tuple[float | None, float | None]:
-    """Share of episodes that reached the goal, and their speed (`goal_speed`); None of a task without a goal."""
     part = task.state_slices.get("target_vector")
     if part is None:
         return None, None
-    reached = simulation.terminated
-    distance = arithmetic.norm(simulation.state[:, 0, part])
-    return float(reached.mean()), goal_speed(distance, simulation.length, reached, task)
+    speed = arithmetic.norm(start[:, part]) / (length * task.seconds_per_step)
+    return float(reached.mean()), float(speed[reached].mean()) if reached.any() else None

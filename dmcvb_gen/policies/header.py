@@ -99,11 +99,6 @@ class PolicyHeader(_Model):
         return {name: value for name, value in write(self).items() if (name, value) != ("action_repeat", 2)}
 
     @property
-    def origin(self) -> str:
-        """Origin of the policy, in a few words."""
-        return origin_of(self.algorithm)
-
-    @property
     def acts_every(self) -> int | None:
         """Control steps for which its actions are held; None of the user's code and of other programs' policies."""
         outside = self.algorithm == OWN_CODE or "converted_from" in self.training

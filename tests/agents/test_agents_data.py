@@ -265,6 +265,17 @@ def test_the_curve_has_losses_hold_out_and_scores(monkeypatch):
     assert curve[-1]["loss"] < curve[0]["loss"]
 
 
+def test_random_numbers_of_a_step_hang_on_the_seed_and_on_the_step(monkeypatch):
+    data, drawn = make_data().states_only(), []
+    for seed in (0, 0, 1):
+        learner = state_learner(data)
+        monkeypatch.setattr(
+            learner, "update", lambda _: {"loss": drawn.append(torch.rand(1).item()) or torch.zeros(())}
+        )
+        train(learner, data, dataclasses.replace(SHORT, seed=seed), 3)
+    assert drawn[:3] == drawn[3:6] and len(set(drawn)) == 6
+
+
 def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to(monkeypatch):
     monkeypatch.setattr(trainer, "TICK_SECONDS", -1.0)
     data, rates = make_data().states_only(), {True: [], False: []}

@@ -38,7 +38,7 @@ def test_a_policy_sees_stacks_and_states_of_all_episodes_at_once(where, channels
     assert (third[:, 2 * frame :] != second[:, 2 * frame :]).any()  # the newest one is the last
     assert score.pictures.shape == (3, 16, 16, 3) and score.pictures.std() > 5
     assert score.mean == pytest.approx(np.mean(score.returns))
-    again = dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=3, size=16, seed=4, pixels=False)
+    again = dmcvb_gen.evaluate(policy, where, episodes=2, max_steps=3, seed=4, pixels=False)
     assert again.returns == score.returns and set(seen[-1]) == {"state"}
 
 
@@ -112,6 +112,14 @@ def test_a_place_that_cannot_be_evaluated_is_refused_with_what_can(where, told):
 def test_options_that_mean_nothing_are_refused(option):
     with pytest.raises(DmcvbError, match=f"{next(iter(option))} is .*: input should be"):
         dmcvb_gen.evaluate(lambda observation: None, "walker-walk/none", pixels=False, **option)
+
+
+@pytest.mark.parametrize("option", [dict(stack=2), dict(size=32), dict(renderer="native"), dict(backgrounds="clips")])
+def test_options_of_images_that_nobody_sees_are_refused(option):
+    with pytest.raises(DmcvbError, match=f"{next(iter(option))} has no effect without pictures; leave it out"):
+        dmcvb_gen.evaluate(lambda observation: None, "walker-walk/dynamic", pixels=False, **option)
+    with pytest.raises(DmcvbError, match="walker-walk/dynamic_camera0.2 shows no videos, so backgrounds"):
+        dmcvb_gen.evaluate(lambda observation: None, "walker-walk/dynamic_camera0.2", backgrounds="builtin")
 
 
 @pytest.mark.full

@@ -143,15 +143,6 @@ def test_a_changed_file_is_noticed_and_an_unchanged_one_not_read_again(tmp_path)
     assert load_backgrounds(tmp_path).lengths == (4,) and load_backgrounds(tmp_path).digest != first.digest
 
 
-def test_only_the_videos_in_play_are_opened_when_asked_for(tmp_path):
-    for index in range(3):
-        write_video(tmp_path / "train" / f"{index}.webp", clip(3, seed=index))
-    (tmp_path / "train" / "9.webp").write_bytes(b"broken")
-    assert load_backgrounds(tmp_path, videos=3).names == ("0", "1", "2")
-    with pytest.raises(BackgroundError, match="9.webp"):
-        load_backgrounds(tmp_path)
-
-
 def test_long_videos_count_with_their_first_frames_and_memory_is_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(backgrounds_module, "MAX_FRAMES", 6)
     monkeypatch.setattr(backgrounds_module, "CACHE_BYTES", 10 * 256 * 256 * 3)

@@ -169,11 +169,6 @@ def test_a_file_that_does_not_fit_is_refused(policy_path, tmp_path, change, word
     tracemalloc.stop()
 
 
-def test_a_header_says_how_its_policy_came_to_be():
-    assert "DAgger" in header_of(algorithm="guided").origin and "SAC" in header_of().origin
-    assert header_of(algorithm="my-own").origin == "by my-own"
-
-
 def test_policies_act_without_torch():
     code = "import sys; sys.modules['torch'] = sys.modules['stable_baselines3'] = None\n"
     code += "from dmcvb_gen.policies import actor, bundled, evaluation, paper, policy_file, simulate\n"

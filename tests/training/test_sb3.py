@@ -7,6 +7,7 @@ import pytest
 import torch
 from stable_baselines3.common.vec_env import VecNormalize
 
+from dmcvb_gen.policies.header import origin_of
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import run as runs
@@ -54,7 +55,7 @@ def test_an_exported_policy_acts_as_the_model_it_comes_from(tmp_path, models, mo
     np.testing.assert_allclose(policy.act(observation, deterministic=True), wanted, atol=2e-5)
     header = policy.header
     assert header.algorithm == algorithm and header.evaluation.episodes >= 1 and f"--algo {algorithm}" in header.command
-    assert algorithm.removeprefix("sb3:") in header.origin
+    assert algorithm.removeprefix("sb3:") in origin_of(header.algorithm)
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import selection
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.selection import MIXED_COUNT, converge, pick_checkpoints, read_curve, select_checkpoints
-from tests.conftest import TINY_MAZE, invoke, told
+from tests.conftest import invoke, told
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -185,11 +185,6 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
             steps, returns, _ = zip(*read_curve(run_folder), strict=True)
             curve = {"steps": list(steps), "returns": [round(value, 2) for value in returns]}
             assert header.training["curve"] == curve
-
-
-def test_the_way_begins_at_random_actions_only_where_returns_may_be_negative():
-    assert selection._base(get_task("walker-walk"), 2) == 0
-    assert selection._base(get_task(TINY_MAZE), 1) < 0
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):

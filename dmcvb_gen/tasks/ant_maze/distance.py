@@ -102,12 +102,7 @@ def look_up(layout: Layout, fields: np.ndarray, positions: np.ndarray) -> np.nda
 
 def blend(layout: Layout, fields: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Do as `look_up`, blended between the pixels of geodesic fields."""
-    height, width = fields.shape[1:]
-    each = np.arange(len(fields))
-    low = np.clip((layout.grid(positions) + 0.5) * PIXELS - 0.5, 0, [height - 1.0, width - 1.0])
-    corner = np.minimum(low.astype(int), [height - 2, width - 2])
-    weight = low - corner
-    row, column = corner.T
-    top = fields[each, row, column] * (1 - weight[:, 1]) + fields[each, row, column + 1] * weight[:, 1]
-    bottom = fields[each, row + 1, column] * (1 - weight[:, 1]) + fields[each, row + 1, column + 1] * weight[:, 1]
-    return top * (1 - weight[:, 0]) + bottom * weight[:, 0]
+    from scipy import ndimage
+
+    row, column = ((layout.grid(positions) + 0.5) * PIXELS - 0.5).T
+    return ndimage.map_coordinates(fields, [np.arange(len(fields)), row, column], order=1, mode="nearest")
