@@ -50,10 +50,6 @@ def test_a_log_gets_lines_that_end_at_what_they_expected(tmp_path, monkeypatch, 
             assert all(unit in line for line in shown), told
 
 
-def test_a_log_gets_nothing_of_a_quick_command(small_release):
-    assert "%|" not in invoke("verify", small_release, code=0).stderr
-
-
 @pytest.mark.slow_cases("ant-maze-empty7x7", "walker-walk")
 @pytest.mark.parametrize("task", TASKS)
 def test_images_and_scores_are_told_while_cells_train(tmp_path, monkeypatch, task):

@@ -7,7 +7,6 @@ import os
 import pytest
 
 from dmcvb_gen.parallel import cores
-from dmcvb_gen.parallel.memory import free_memory
 from tests.conftest import python
 
 
@@ -19,10 +18,6 @@ def test_the_fewer_of_affinity_and_container_count(tmp_path, monkeypatch, limit,
         (tmp_path / "cpu.max").write_text(limit + "\n")
     assert cores.usable_cores() == wanted
     assert [cores.default_workers(most) for most in (0, 2, 100)] == [1, min(2, wanted), wanted]
-
-
-def test_free_memory_is_some_of_what_the_machine_has():
-    assert 0 < free_memory() < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no processes")
