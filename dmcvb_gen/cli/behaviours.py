@@ -87,8 +87,9 @@ def _list_settings(as_json, *, task, algo, settings, **_):
 @click.option(
     "--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes to score each pick."
 )
+@click.option("--convergence", type=float, metavar="RETURN", help="Return at convergence of another run of the task.")
 @json_option
-def select_checkpoints(run, episodes, as_json):
+def select_checkpoints(run, episodes, convergence, as_json):
     """Pick the expert, medium and mixed checkpoints of a run.
 
     Expert: the first with 95 % of the return at convergence; medium: half of it (mazes: nearest to the paper's row);
@@ -102,7 +103,7 @@ def select_checkpoints(run, episodes, as_json):
     from dmcvb_gen.training.selection import selection_json
 
     with ProgressBar(not as_json, unit=" checkpoints", desc="selection") as bar:
-        picked = select(run, episodes, bar)
+        picked = select(run, episodes, bar, convergence)
     if as_json:
         print_json(selection_json(picked))
     else:

@@ -282,7 +282,9 @@ def _mixed(curve: Sequence[Point], last: int, check: Callable) -> tuple[Pick, ..
     )
 
 
-def select_checkpoints(folder: str | Path, episodes: int = 100, progress: ProgressCallback = ignore) -> Selection:
+def select_checkpoints(
+    folder: str | Path, episodes: int = 100, progress: ProgressCallback = ignore, convergence: float | None = None
+) -> Selection:
     """Pick expert, medium and mixed from a run folder and write them into its `selected/` folder.
 
     Also writes selection.json and curve.png. Works on a running run too; what cannot be picked yet is said
@@ -290,6 +292,7 @@ def select_checkpoints(folder: str | Path, episodes: int = 100, progress: Progre
 
     Args:
       progress: called with the name of each checkpoint that is evaluated on fresh episodes.
+      convergence: return at convergence that another run of the task has shown, instead of this one's.
 
     Raises:
       DmcvbError: the folder holds no run.
@@ -308,6 +311,8 @@ def select_checkpoints(folder: str | Path, episodes: int = 100, progress: Progre
         return evaluate(policy, task, episodes, SEED, streams=FRESH)[0]
 
     end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
+    if convergence is not None:
+        end = Convergence(convergence, math.nan, True, "as was given")
     selection = pick_checkpoints(task.id, curve, base, end, measure)
     expect(progress, len(measured))
     with storage_errors(folder, "write to"):

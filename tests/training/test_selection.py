@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.own_code import TASKS
 from dmcvb_gen.policies.actor import random_policy
 from dmcvb_gen.policies.bundled import level_files
@@ -185,11 +185,9 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
             steps, returns, _ = zip(*read_curve(run_folder), strict=True)
             curve = {"steps": list(steps), "returns": [round(value, 2) for value in returns]}
             assert header.training["curve"] == curve
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(DmcvbError, match="give a run folder"):
-        select_checkpoints(tmp_path)
+    longer = invoke("select-checkpoints", run_folder, "--episodes", 3, "--convergence", 900, "--json", code=1).stdout
+    given = {"value": 900.0, "error": None, "converged": True, "reason": "as was given"}
+    assert json.loads(longer)["convergence"] == given
 
 
 def test_a_folder_that_cannot_be_written_to_is_one_line(run_folder, monkeypatch):
