@@ -60,7 +60,7 @@ def validate(
       benchmarks: b1, b2, b3, b4.
       agents (A,B): Agents to train, e.g. bc,state-bc,id+bc. [default: the benchmark's]
       only (PATTERN): Use only these subsets, e.g. 'walker-walk/expert/*'.
-      out (FOLDER): Folder of the report. [default: reports/NAME]
+      out (FOLDER): Folder of the report. [default: reports/NAME, or reports/NAME-checks]
       checks_only: Check the structure and train nothing.
       train_unsound: Run the benchmarks even if a check fails.
       workers: Cells side by side. [default: 2, on one core 1]
@@ -98,7 +98,8 @@ def validate(
     chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
     if patterns:  # a subset that was not asked for is not missing
         missing = [one for one in missing if any(matches(name, patterns) for name in one.subsets)]
-    folder = local_path(out or Path("reports") / Path(release).resolve().name)
+    name = Path(release).resolve().name + "-checks" * checks_only  # a report of trainings stays as it is
+    folder = local_path(out or Path("reports") / name)
     claim_folder(folder, data, budget, training=bool(cells))
     results = []
     with progress_bar(progress, " checks", "structure", scaled=False) as bar:
