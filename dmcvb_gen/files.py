@@ -175,9 +175,7 @@ def read_yaml(path: Path | Traversable) -> Any:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Put `value` (plain, or a pydantic model) as JSON in place of the file at `path`, see `write_bytes`."""
-    if hasattr(value, "model_dump"):
-        value = value.model_dump(mode="json")
+    """Put a plain value as JSON in place of the file at `path`, see `write_bytes`."""
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 

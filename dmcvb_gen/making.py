@@ -103,10 +103,12 @@ def rollout(
       DmcvbError: an unknown name, a value that is wrong, an option that would have no effect, or no room.
     """
     options = locals()
+    from dmcvb_gen.generate.counts import check_room
     from dmcvb_gen.generate.plan import plan_of, run_plan, start
     from dmcvb_gen.loaders.release import open_for_reading
 
     plan = plan_of(options)
+    check_room(plan)
     start(plan, other_versions)
     with progress_bar(progress, f" {plan.unit}", plan.release.manifest.name) as bar:
         run_plan(plan, workers, bar)

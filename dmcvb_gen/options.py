@@ -11,7 +11,7 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar
 
@@ -104,7 +104,7 @@ def _checked(name: str, value: Any, annotation: Any) -> Any:
 
     _, marks = parts_of(annotation)
     taken = value
-    if SEVERAL in marks and value is not None:
+    if SEVERAL in marks and isinstance(value, Iterable):
         taken = (value,) if isinstance(value, str | Path) else tuple(value)
     try:
         taken = pydantic.TypeAdapter(annotation).validate_python(taken)

@@ -16,7 +16,7 @@ import numpy as np  # noqa: E402
 
 from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors  # noqa: E402
 from dmcvb_gen.rendering import make_renderer  # noqa: E402
-from dmcvb_gen.seeding import episode_stream  # noqa: E402
+from dmcvb_gen.seeding import STREAMS, episode_stream  # noqa: E402
 from dmcvb_gen.spec import is_maze  # noqa: E402
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task  # noqa: E402
 
@@ -28,11 +28,10 @@ def frames_of(task_id: str, setting: DistractorSetting, episodes: int, steps: in
     batch.reset([np.random.default_rng(i) for i in range(episodes)])
     rng, rows = np.random.default_rng(0), [batch.physics()]
     for _ in range(steps - 1):
-        batch.step(rng.uniform(-1, 1, (episodes, task.action_size)))
+        batch.step(task.from_unit(rng.uniform(-1, 1, (episodes, task.action_size))))
         rows.append(batch.physics())
     physics = np.stack(rows, axis=1)
-    names = ("camera", "color", "background", "style")
-    generators = {name: [episode_stream(0, ("bench",), i, name) for i in range(episodes)] for name in names}
+    generators = {name: [episode_stream(0, ("bench",), i, name) for i in range(episodes)] for name in STREAMS}
     labels = sample_distractors(task, setting, physics, generators, load_backgrounds()).flat()
     return task, physics.reshape(-1, physics.shape[-1]), labels
 

@@ -120,13 +120,3 @@ def parse_options(context, parameter, pairs):
             raise click.UsageError(f"Give {name} in the environment: others can read the command line.")
         options[name] = {"true": True, "false": False}.get(value.lower(), value)
     return options
-
-
-remote_option = click.option(
-    "--option",
-    "options",
-    multiple=True,
-    metavar="NAME=VALUE",
-    callback=parse_options,
-    help="Option for the file system (fsspec), e.g. endpoint_url=http://localhost:9000. Repeatable.",
-)

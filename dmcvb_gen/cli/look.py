@@ -6,21 +6,20 @@ import textwrap
 
 import click
 
+from dmcvb_gen import making
 from dmcvb_gen.cli.common import (
     json_option,
     print_json,
     print_table,
-    remote_option,
 )
-from dmcvb_gen.storage.places import is_url, shown
+from dmcvb_gen.cli.options import command_of
+from dmcvb_gen.storage.places import is_url, shown, unpinned
 from dmcvb_gen.text import format_bytes, pluralize, quoted
 
 
-@click.command()
+@command_of(making.rollout, only=("storage_options",))
 @click.argument("path", metavar="RELEASE|URL")
-@remote_option
-@json_option
-def info(path, options, as_json):
+def info(path, storage_options, as_json, progress):
     """Show the subsets, episodes, bytes and returns of a release, and the paper's returns.
 
     \b
@@ -28,7 +27,7 @@ def info(path, options, as_json):
     """
     from dmcvb_gen.generate.info import STATISTICS, describe_release
 
-    facts = describe_release(path, options)
+    facts = describe_release(path, storage_options)
     if as_json:
         return print_json(facts)
     rows = []
@@ -71,7 +70,7 @@ def info(path, options, as_json):
     if any(subset["paper"] and subset["other_length"] for subset in facts["subsets"]):
         click.echo("* Episodes have another length than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
-        paint = f"fetch {shown(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(path)}"
+        paint = f"fetch {shown(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(unpinned(path))}"
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
     if facts["digest"]:
         click.echo(f"digest {facts['digest']}")

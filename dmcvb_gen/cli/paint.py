@@ -33,7 +33,7 @@ def paint(release, as_json, **options):
 def fetch(as_json, **options):
     """Download a published release, or a part of it. Rerun the command to resume or to add more.
 
-    With --paint, images are rendered during the download; the exit code is 1 if they differ from the published ones.
+    With --paint, images are rendered after the download; the exit code is 1 if they differ from the published ones.
 
     \b
     dmcvb-gen fetch s3://bucket/mini --only 'walker-walk/*' --out data/mini

@@ -13,7 +13,7 @@ from dmcvb_gen.release.export import export as run_export
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.release.publish import publish as run_publish
 from dmcvb_gen.release.verify import verify as run_verify
-from dmcvb_gen.storage.places import is_url, shown
+from dmcvb_gen.storage.places import is_url, shown, unpinned
 from dmcvb_gen.text import pluralize, quoted
 
 
@@ -68,7 +68,8 @@ def _verified(path, result):
 
 def _cures(path, places):
     """Yield the commands that repair damaged places: layers, or files of none."""
-    if places and is_url(str(path)):
+    path = unpinned(path)
+    if places and is_url(path):
         yield f"`dmcvb-gen publish FOLDER {quoted(path)} --repair` replaces damaged and missing files."
         return
     videos = {place for place in places if place.startswith(VIDEOS)}
@@ -105,7 +106,7 @@ def _regenerated(place, outcome):
         for name, (there, here) in outcome.environment.items():
             yield f"environment: {name} was {there} and is {here} on this machine"
         if not outcome.environment:
-            yield "environment: same versions and processor as the release's"
+            yield "environment: no difference is known"
     if outcome.restored:
         files = pluralize(len(outcome.restored), "other files")
         yield f"{place}: restored {files}, e.g. {outcome.restored[0]}"

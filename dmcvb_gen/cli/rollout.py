@@ -8,7 +8,7 @@ import time
 import click
 
 from dmcvb_gen import making
-from dmcvb_gen.cli.common import answer, json_option, print_json, print_table, remote_option
+from dmcvb_gen.cli.common import answer, print_json, print_table
 from dmcvb_gen.cli.options import command_of, parse_part
 from dmcvb_gen.options import progress_bar
 from dmcvb_gen.storage.places import is_url
@@ -78,13 +78,16 @@ NOT_BEGUN = {"only", "episode_range"}  # whole recipes are begun
 BEGUN = {heading: tuple(one for one in names if one not in NOT_BEGUN) for heading, names in OPTION_GROUPS.items()}
 
 
-@command_of(making.rollout, groups=BEGUN, only=("tasks", *sum(BEGUN.values(), ())), epilog=DISTRACTORS)
-def begin(as_json, progress, **options):
+BEGIN = ("tasks", "other_versions", *sum(BEGUN.values(), ()))
+
+
+@command_of(making.rollout, groups=BEGUN, only=BEGIN, epilog=DISTRACTORS)
+def begin(as_json, progress, other_versions, **options):
     """Create a release without generating any episodes. The options are those of `rollout`."""
     from dmcvb_gen.generate.plan import start
 
     plan = _plan(options | {"only": (), "episode_range": None})
-    start(plan, command="cluster begin")
+    start(plan, other_versions, command="cluster begin")
     place = quoted(plan.store.place)
     begun = f"begun, {pluralize(len(plan.works), 'shards')} to make: dmcvb-gen cluster part {place} 1/N to N/N"
     answer(as_json, {"out": plan.store.place, "shards": len(plan.works)}, f"{plan.store.place}: {begun}")
@@ -104,18 +107,16 @@ def part(release, part, as_json, workers, other_versions, only, episode_range, s
     _run(plan, workers, as_json, whole=False)
 
 
-@click.command()
+@command_of(making.rollout, only=("storage_options",))
 @click.argument("release", metavar="RELEASE|URL")
-@remote_option
-@json_option
-def finish(release, options, as_json):
+def finish(release, storage_options, as_json, progress):
     """Write the manifest of all finished shards. Exit code 1 while shards are missing."""
     from dmcvb_gen.dataset.gate import Release
     from dmcvb_gen.dataset.writer import finish as write
     from dmcvb_gen.generate.works import missing_subsets
     from dmcvb_gen.storage.store import open_store
 
-    store = open_store(release, options)
+    store = open_store(release, storage_options)
     Release.in_making(store)  # or says that nothing was begun there
     done = write(store)
     missing = missing_subsets(done)

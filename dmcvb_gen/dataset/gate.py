@@ -51,12 +51,12 @@ from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.spec import select
+from dmcvb_gen.storage.places import PINNED
 from dmcvb_gen.storage.store import NotThere, Store, open_store
 from dmcvb_gen.text import pluralize
 
 READERS = 16
 """Small files of a bucket that are read at a time."""
-_PINNED = re.compile(r"(?P<place>.+)@(?P<digest>sha256:.*|[0-9a-fA-F]{64})")
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,9 @@ class Release:
           StoreError: there is no release, its manifest is damaged or has another digest.
         """
         if not isinstance(place, Store):
-            if pinned := _PINNED.fullmatch(str(place)):
+            if pinned := PINNED.fullmatch(str(place)):
+                if digest is not None and _plain_digest(digest) != _plain_digest(pinned["digest"]):
+                    raise StoreError(f"{place}: another digest is given, {digest}; give one of them")
                 place, digest = pinned["place"], pinned["digest"]
             place = open_store(place, options)
         digest = None if digest is None else _plain_digest(digest)

@@ -10,7 +10,7 @@ import numpy as np
 import zarr
 
 from dmcvb_gen.dataset.manifest import ArraySpec, Layer, SubsetRecord, runs
-from dmcvb_gen.dataset.pictures import picture_of
+from dmcvb_gen.dataset.pictures import picture_of, shown
 from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
@@ -188,7 +188,7 @@ class Subset:
 
     def _layer_of(self, name: str) -> tuple[Layer, ArraySpec]:
         if name not in self._specs:
-            if picture_of(name) is not None and not self.pixel_arrays:
+            if name in shown(self).arrays:
                 raise StoreError(self._without_images)
             raise UnknownNameError(f"array of {self.name}", name, self.arrays)
         return self._specs[name]
@@ -242,8 +242,7 @@ class Subset:
         """(episode of the whole subset,) bool: here, but without the images that the subset is about."""
         here = np.zeros(self.record.episodes, bool)
         here[self._episodes] = True
-        images = [layer for layer in self.layers if any(picture_of(spec.name) for spec in layer.arrays)]
-        lacking = [self.missing(layer) for layer in images] or [np.ones(self.record.episodes, bool)]
+        lacking = [self.missing(self._specs[n][0]) if n in self._specs else here for n in shown(self).arrays]
         return here & np.any(lacking, axis=0)
 
     # -- episodes -------------------------------------------------------------------------------------

@@ -181,9 +181,7 @@ def wrong_bytes(store: Store, file: FileRecord) -> str | None:
     """Say what is wrong with a file of a release, in words that follow its name; None if every byte is as recorded."""
     try:
         size = store.size(file.path)
-        if size is None:
-            return "is missing"
-        if size != file.bytes:
+        if size not in (None, file.bytes):
             return f"has {size} bytes instead of {file.bytes}"
         return None if store.sha256(file.path, file.bytes) == file.sha256 else "does not have its digest"
     except NotThere:

@@ -43,6 +43,7 @@ from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.storage.store import Store
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
+from dmcvb_gen.text import quoted
 
 ANY_BITS = ("opengl",)
 """Renderers whose images may differ from machine to machine: the first shard that is put is the release's."""
@@ -266,7 +267,8 @@ def _read_array(store: Store, layer: Layer, spec: ArraySpec, shard: int, record:
     file, path = record.files.get(spec.name), layer.file_path(spec, shard)
     data = store.read(path, file.bytes) if file else None
     if file and sha256_bytes(data or b"") != file.sha256:
-        raise StoreError(f"{store.place}/{path} does not have its digest; run `dmcvb-gen regenerate {store.place}`")
+        cure = f"run `dmcvb-gen regenerate {quoted(store.place)}`"
+        raise StoreError(f"{store.place}/{path} does not have its digest; {cure}")
     return decode(layer, spec, data)
 
 

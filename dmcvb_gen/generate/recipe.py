@@ -37,6 +37,7 @@ from dmcvb_gen.spec import (
     is_maze,
     parse_setting,
 )
+from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 
@@ -345,7 +346,7 @@ def load_recipe(source: str | Path) -> Recipe:
       UnknownNameError: a plain name that is no shipped recipe's.
       RecipeError: no such file, not YAML, or a field that is unknown or wrong (named, with what was expected).
     """
-    path = Path(source).expanduser()
+    path = local_path(source)
     if not path.is_file() and not path.suffix and path.name == str(source) and str(source) not in shipped_recipes():
         raise UnknownNameError("recipe", source, shipped_recipes())
     shipped = not path.is_file() and str(source) in shipped_recipes()

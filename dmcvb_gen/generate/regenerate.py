@@ -105,7 +105,8 @@ class Regeneration:
         outcomes = self.run(works, progress)
         if works:
             write_provenance(store, "regenerate")
-        write_plain_metadata(Release.open(store))
+        if not release.in_the_making:
+            write_plain_metadata(Release.open(store))
         check_agree(release.recipes)  # nothing gives a recipe back
         return Outcome(outcomes, environment_diff(store), restored=tuple(restored))
 
@@ -113,7 +114,8 @@ class Regeneration:
         """Write a new release from the recipes of this one, see `remake`."""
         store = open_store(self.place)
         release = Release.open(store)
-        if store.place == open_store(out).place:
+        there = open_store(out)
+        if store.place == there.place or store.folder and store.folder.resolve() == Path(there.place).resolve():
             raise StoreError(f"--out {out} is the release itself; remove --out to repair it in place")
         known = Shipped(release.manifest, release.recipes, record_digests(release))  # type: ignore[arg-type]
         made = remake(known, out, store, self, progress)
@@ -132,7 +134,8 @@ class Regeneration:
         """(layer, shard) of those whose files are not as listed; records are put back, and added to `restored`."""
         asked, found = bool(self.only or self.episodes), set[tuple[str, int]]()
         for shard in release.shards(release.select(self.only), self.episodes):
-            if not (asked or shard.here or _is_promised(release, shard.layer.name, shard.number)):
+            promised = release.copy.shards(shard.layer.name) if release.copy else ()
+            if not (asked or shard.here or shard.number in promised):
                 continue
             damaged = any(wrong_bytes(release.store, file) for file in shard.files)
             if damaged:
@@ -242,8 +245,3 @@ def restore_lists(store: Store) -> list[str]:
             put(store, list_path(layer.list), text)
             restored.append(list_path(layer.list))
     return restored
-
-
-def _is_promised(release: Release, layer: str, shard: int) -> bool:
-    runs = release.copy.promised.get(layer, ()) if release.copy else ()
-    return any(first <= shard < last for first, last in runs)

@@ -32,11 +32,13 @@ from dmcvb_gen.generate.resolve import (
     video_files,
 )
 from dmcvb_gen.generate.works import can_be_rendered, works_of
+from dmcvb_gen.options import refuse
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import DistractorSetting, is_maze
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
+from dmcvb_gen.text import quoted
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ def _own_videos(release: Release, root: Path, old: SubsetRecord) -> str:
     source = background_source(root, old)
     for file in release.inputs_of([old.name]):
         if file.path.startswith(VIDEOS) and (wrong := wrong_bytes(release.store, file)):
-            raise StoreError(f"{release.place}/{file.path} {wrong}; run `dmcvb-gen regenerate {release.place}`")
+            raise StoreError(f"{release.place}/{file.path} {wrong}; run `dmcvb-gen regenerate {quoted(release.place)}`")
     return source
 
 
@@ -180,9 +182,8 @@ def _check_options_used(request: Repainting, records: Iterable[SubsetRecord]) ->
     """Refuse options of videos if none of the new subsets shows any."""
     videos = any(record.distractor.shows_videos for record in records)
     heard = {"backgrounds": videos, "split": videos or any(is_maze(record.task) for record in records)}
-    for name, has_effect in heard.items():
-        if getattr(request, name) and not has_effect:
-            raise RecipeError(f"--{name} has no effect: these subsets show no videos; remove it")
+    idle = {name: getattr(request, name) and not has_effect for name, has_effect in heard.items()}
+    refuse("these subsets show no videos", **idle)
 
 
 def _check_out(store: Store, resolved: Resolved) -> None:
@@ -198,6 +199,7 @@ def _copy(source: Store, target: Store, shard: Shard) -> None:
     for file in shard.files:
         data = source.read(file.path, file.bytes)
         if sha256_bytes(data) != file.sha256:
-            raise StoreError(f"{source.place}/{file.path} is damaged; run `dmcvb-gen regenerate {source.place}`")
+            cure = f"run `dmcvb-gen regenerate {quoted(source.place)}`"
+            raise StoreError(f"{source.place}/{file.path} is damaged; {cure}")
         put(target, file.path, data)
     put_record(target, shard.layer, shard.number, shard.record)

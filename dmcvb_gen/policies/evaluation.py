@@ -19,8 +19,6 @@ def evaluate(
     task: Task,
     episodes: int = 100,
     seed: int = 1,
-    deterministic: bool = True,
-    threads: int = 1,
     streams: str = "evaluation",
 ) -> tuple[Evaluation, Simulation]:
     """Roll a policy out over fresh episodes (streams of their own, apart from every release's).
@@ -31,9 +29,7 @@ def evaluate(
     Returns:
       Return statistics, and the episodes they come from.
     """
-    out = simulate(
-        task, [policy], range(episodes), seed, (task.id, streams), deterministic=deterministic, threads=threads
-    )
+    out = simulate(task, [policy], range(episodes), seed, (task.id, streams))
     returns = out.returns
     lowest, lower, middle, upper, highest = map(float, np.quantile(returns, (0, 0.25, 0.5, 0.75, 1)))
     success, speed = goal_scores(task, out.state[:, 0], out.length, out.terminated)
@@ -42,7 +38,7 @@ def evaluate(
             mean=float(returns.mean()),
             std=float(returns.std()),
             episodes=episodes,
-            mode="mean" if deterministic else "sampled",
+            mode="mean",
             seed=seed,
             quartiles=(lowest, lower, middle, upper, highest),
             success=success,

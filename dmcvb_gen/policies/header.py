@@ -57,7 +57,7 @@ class PolicyHeader(_Model):
     Attributes:
       task: the task's id.
       observation: the name of what it sees, `task.observation`.
-      algorithm: algorithm that trained it, e.g. "sac"; `origin` says it in words.
+      algorithm: algorithm that trained it, e.g. "sac"; `origin_of` says it in words.
       agent_step: environment steps (at its action repeat) it was trained for.
       action_repeat: control steps that its actions were held in training; files leave out 2.
       hidden: widths of the hidden layers.
@@ -69,7 +69,7 @@ class PolicyHeader(_Model):
       clip_observation: normalized observations are clipped to +- this.
       training: settings, seed, wall time, versions; of a picked policy also `selection`, what it was picked for, and
         `curve`, the steps and returns of its run's evaluations.
-      command: command that trains it again.
+      command: command that trained it, by the version that `training` names.
     """
 
     format: Literal["dmcvb-gen policy"] = "dmcvb-gen policy"

@@ -18,7 +18,7 @@ import yaml
 from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import CARD_FOLDER, Manifest, Resolved
+from dmcvb_gen.dataset.manifest import CARD_FOLDER, MANIFEST, Manifest, Resolved
 from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.distractors.registry import distractors_of
@@ -147,6 +147,8 @@ def _open(root: Location) -> Release:
         raise StoreError(f"{root} has no episodes yet; run the rollout first")
     if release.in_the_making:
         raise StoreError(f"{root} is not complete; finish it with the same rollout, without --only")
+    if release.manifest_path != MANIFEST:
+        raise StoreError(f"{root} has grown since, and a card is of the whole of it; leave the digest out")
     here = tuple(record for record in release.manifest.subsets if record.name in release.subsets)
     manifest = release.manifest.model_copy(update={"subsets": here})
     return Release(release.store, manifest, release.digest, release.compared, release.copy)

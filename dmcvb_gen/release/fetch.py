@@ -90,7 +90,9 @@ def _fetch(
 ) -> Moved:
     target, names = download.target, source.select(only)
     if source.in_the_making:
-        raise StoreError(f"{source.place} is not finished; finish it first: dmcvb-gen rollout --out {source.place}")
+        raise StoreError(
+            f"{source.place} is not finished; finish it first: dmcvb-gen rollout --out {quoted(source.place)}"
+        )
     check_apart(source, target, f"choose another --out, or render its images: dmcvb-gen paint {quoted(source.place)}")
     there, text = manifest_at(target, source), manifest_text(source)
     shards = [shard for shard in source.shards(names, episodes) if shard.here]

@@ -92,7 +92,7 @@ class Renderer(abc.ABC):
 def moved_lamps(
     model: mujoco.MjModel, position: np.ndarray, direction: np.ndarray, shift: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move lamps by a shift. A directional one turns as if it stood at its height and kept to the point below it.
+    """Move lamps by a shift. A directional one turns as if it stood at its height (0: a meter) and kept to its point.
 
     Args:
       position, direction: (frame, lamp, 3) float64, of all lamps of the model.
@@ -103,7 +103,8 @@ def moved_lamps(
     """
     shift = shift.astype(np.float64)[:, None]
     spot = (model.light_type != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)[None, :, None]
-    turned = direction * np.abs(position[..., 2:]) - shift
+    height = np.abs(position[..., 2:])
+    turned = direction * np.where(height > 0, height, 1.0) - shift
     turned /= np.maximum(np.sqrt((turned * turned).sum(axis=-1, keepdims=True)), 1e-9)
     return np.where(spot, position + shift, position), np.where(spot, direction, turned)
 

@@ -85,7 +85,7 @@ class Store(abc.ABC):
 
     def _list(self, prefix: str) -> Mapping[str, int]:
         """Every file below a folder ("" for all): path -> bytes. Raises FileNotFoundError."""
-        raise StoreError(f"{self.place} gives no list of its files; fetch the release first")
+        raise StoreError(f"{self.place} gives no list of its files; check the URL, or fetch the release first")
 
     def _create(self, path: str, data: bytes | Path) -> None:
         """Write a file as one atomic operation. Raises FileExistsError."""

@@ -12,6 +12,8 @@ from dmcvb_gen.errors import StoreError
 BUCKETS = {"s3": "s3fs", "gs": "gcsfs", "az": "adlfs"}
 """Protocol of object stores -> the package on PyPI that reaches them."""
 WEB = ("http", "https")
+PINNED = re.compile(r"(?P<place>.+)@(?P<digest>sha256:.*|[0-9a-fA-F]{64})")
+"""A place with the digest of the release that is meant."""
 _SCHEME = re.compile(r"([A-Za-z][\w+.-]+):(/*)")
 KNOWN = "a folder, file:, s3://, gs://, az://, http(s):// or hf://"
 
@@ -97,6 +99,12 @@ def shown(place: str | Path) -> str:
     return found[0] + (re.sub(r"[?#].*", "", rest) if found[1].lower() in WEB else rest)
 
 
+def unpinned(place: str | Path) -> str:
+    """A place without the digest that may stand behind it."""
+    pinned = PINNED.fullmatch(str(place))
+    return pinned["place"] if pinned else str(place)
+
+
 def local_path(path: str | Path) -> Path:
     """A folder or file of this machine, to be written to.
 
@@ -109,7 +117,7 @@ def local_path(path: str | Path) -> Path:
             f"{shown(text)} is a URL; give a local one, a folder or file of this machine (`dmcvb-gen publish "
             "FOLDER URL` puts a release at a URL)"
         )
-    return Path(text).expanduser()
+    return Path(_folder(text))
 
 
 def _without_login(rest: str) -> tuple[str, str]:

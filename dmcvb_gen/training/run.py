@@ -383,8 +383,10 @@ def start_from(learner: Any, run: Run) -> None:
                 )
             return learner.load_networks(saved["learner"])
         policy = load_policy(source)
-        if policy.header.activation != run.header.activation:
-            raise RuntimeError(f"activation {policy.header.activation}, expected {run.header.activation}")
+        for name in ("activation", "clip_observation"):
+            own, expected = getattr(policy.header, name), getattr(run.header, name)
+            if own != expected:
+                raise RuntimeError(f"{name} {own}, expected {expected}")
         learner.load_actor(as_tensors(policy.weights))
     except (RuntimeError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]

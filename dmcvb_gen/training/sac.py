@@ -494,7 +494,9 @@ class Sac(Learner):
             self.critic.requires_grad_(True)
             self._losses |= {"actor_loss": loss.detach(), "entropy": -log_prob.detach()}
             self.descend("alpha", -self.log_alpha.exp() * (log_prob.detach() + self.target_entropy))
-        torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), 1 - settings.target_decay)
+        with torch.no_grad():
+            old, new = list(self.target.parameters()), list(self.critic.parameters())
+            torch._foreach_lerp_(old, new, 1 - settings.target_decay)
 
     def metrics(self) -> dict[str, float]:
         """Losses, policy entropy (nats) and temperature of the last update."""

@@ -88,8 +88,9 @@ def check(run: Run) -> None:
         raise DmcvbError(f"--init-from has no effect with --algo {run.config.algorithm}: remove it")
     model = make_model(run)
     export(run, model)
-    first = getattr(model, "n_steps", 0) * run.settings.simulations or getattr(model, "learning_starts", 0)
-    if run.config.steps < first:
+    simulations, starts = run.settings.simulations, getattr(model, "learning_starts", None)
+    first = model.n_steps * simulations if starts is None else starts // simulations * simulations + simulations
+    if run.config.steps <= first:  # SB3 learns after a step that is not the last one
         raise DmcvbError(
             f"{run.config.algorithm} learns from step {first:,} on, and {run.config.steps:,} are asked for; give more "
             "--steps, or less n_steps or learning_starts with --set"

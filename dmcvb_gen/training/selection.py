@@ -206,7 +206,8 @@ def pick_checkpoints(
     way, check, maze = convergence.value - base, functools.cache(measure), is_maze(task)
     levels = MAZE_TRAINED_LEVELS if maze else TRAINED_LEVELS
     if not way > 0:
-        return Selection(task, base, convergence, {}, dict.fromkeys(levels, convergence.reason))
+        reason = _never_rose(convergence.value, base) if convergence.converged else convergence.reason
+        return Selection(task, base, convergence, {}, dict.fromkeys(levels, reason))
     found: dict[str, tuple[Pick, ...] | str] = {}
     if not convergence.converged:
         found["expert"] = f"not converged: {convergence.reason}; train longer (--resume)"

@@ -1,6 +1,7 @@
 """Export a release's subsets in the formats that other programs read, one folder for each subset."""
 
 import contextlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,8 @@ def export(
 def _stamp(subset: SubsetReader, to: str, episodes: tuple[int, ...]) -> dict[str, Any]:
     """What an export was made from: release, format, and the records of the shards that it reads."""
     shards = subset.shards((episodes[0], episodes[-1] + 1))
+    if to != "zarr":  # others have no images of other sizes, which may be added later
+        shards = (shard for shard in shards if not all(re.match(r"at\d+/", spec.name) for spec in shard.layer.arrays))
     digest = sha256_bytes(b"".join(canonical_json(shard.record) for shard in shards))
     return dict(release=subset.release.manifest.name, format=to, subsets=[[subset.name, digest, list(episodes)]])
 

@@ -267,6 +267,9 @@ def _refuse_what_is_not_painted(
             (model.cam_projection[cameras] != mujoco.mjtProjection.mjPROJ_PERSPECTIVE).any()
             or model.cam_sensorsize[cameras].any()
         ),
+        "a spot lamp wider than 90 degrees": bool(
+            ((model.light_type == mujoco.mjtLightType.mjLIGHT_SPOT) & (model.light_cutoff >= 90))[lights].any()
+        ),
         f"more than {MAX_GEOMS} geoms": len(kind) > MAX_GEOMS,
         "transparent bodies": bool((alpha[kind != PLANE] < 1).any()),
         "infinite planes": bool((size[kind == PLANE][:, :2] <= 0).any()),

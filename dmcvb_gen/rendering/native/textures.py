@@ -123,7 +123,7 @@ class Textures:
 
     Attributes:
       texels: (texel,) int32, the table, then all levels of all textures.
-      table: (texture, column) int32, where they are: see `records.FIRST`. Backgrounds come after the model's own.
+      table: (texture, column) int32, where they are: see `layout.FIRST`. Backgrounds come after the model's own.
       slots: number of backgrounds that there is room for.
     """
 
