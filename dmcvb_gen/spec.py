@@ -18,7 +18,6 @@ from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.own_code import DISTRACTORS, allowed
 
 LOCOMOTION, ANT_MAZE = "locomotion", "ant-maze"
-FAMILIES = (LOCOMOTION, ANT_MAZE)
 """Families of tasks: what a task may vary in, and so which settings it takes. `Task.family` is one of them."""
 
 

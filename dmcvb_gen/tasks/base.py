@@ -94,7 +94,7 @@ class Task(abc.ABC):
 
     Attributes:
       id: the task's name, e.g. "walker-walk".
-      family: "locomotion" or "ant-maze" (`spec.FAMILIES`): which settings it takes.
+      family: "locomotion" or "ant-maze": which settings it takes.
       model: the compiled MuJoCo model. Never change it: renderers and batches share it.
       state_fields: name -> size of each part of the state, in the state's order.
       max_steps: agent steps at which the time limit ends an episode of data.

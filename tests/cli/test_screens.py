@@ -38,11 +38,6 @@ def test_tables_fit_80_columns_and_cut_no_word(small_release, small_mazes, tmp_p
             assert any(word in line for line in lines), (arguments, word, lines)
 
 
-def test_a_wide_terminal_shows_every_column(small_release):
-    text = "\n".join(screen(["info", small_release], columns=200))
-    assert all(name in text for name in ("size", "p25", "median", "p75")) and "not shown" not in text
-
-
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), *(["cluster", name] for name in PARTS)])
 def test_help_fits_80_columns_and_has_an_example(command):
     lines = screen([*command, "--help"])

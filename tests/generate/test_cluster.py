@@ -49,6 +49,7 @@ def test_parts_made_anywhere_give_the_files_of_one_rollout(whole, recipe_file, t
     for part in ("2/3", "1/3"):
         run("cluster", "part", place, part, "--workers", 1)
     assert "not complete" in invoke("cluster", "finish", place, code=1).output
+    run("regenerate", place)
     left = told("rollout", "--out", place, "--dry-run")
     assert left["shards"] == 2 and sum(subset["left"] for subset in left["subsets"]) == 3
     run("cluster", "part", place, "3/3", "--workers", 1)
@@ -56,6 +57,14 @@ def test_parts_made_anywhere_give_the_files_of_one_rollout(whole, recipe_file, t
     done = told("cluster", "finish", place)
     assert done["complete"] and done["digest"] == whole.digest
     assert contents(place) == contents(Path(whole.path)) and told("rollout", "--out", place, "--dry-run")["shards"] == 0
+
+
+def test_images_that_were_asked_for_are_missing_until_they_are_there(tmp_path):
+    words = ["walker-walk", "--level", "random", "--episodes", 2, "--episodes-per-shard", 1, "--max-steps", 3]
+    words += ["--size", 16, "--out", tmp_path / "r"]
+    run("rollout", *words, "--no-pixels")
+    assert not told("rollout", *words, "--range", "0:1")["complete"]
+    assert "shards are missing in 1 subset" in invoke("cluster", "finish", tmp_path / "r", code=1).output
 
 
 def test_two_who_make_the_same_shards_end_in_one_release(whole, tmp_path):

@@ -254,6 +254,8 @@ def test_a_digest_from_outside_is_compared(small_release):
     assert dmcvb_gen.open(small_release, digest=f"sha256:{digest}").compared
     with pytest.raises(StoreError, match="'sha256:12' is no digest; give 64 hexadecimal digits"):
         dmcvb_gen.open(f"{small_release}@sha256:12")
+    with pytest.raises(StoreError, match="another digest is given"):
+        dmcvb_gen.open(f"{small_release}@sha256:{digest}", digest="0" * 64)
     for paint in (False, True):
         with pytest.raises(StoreError, match=f"is release {digest}"):
             dmcvb_gen.open(small_release, digest="0" * 64, paint=paint)

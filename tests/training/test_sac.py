@@ -89,6 +89,7 @@ def test_the_target_follows_by_its_decay():
     before = sac.target.head.clone()
     sac.update(batch_of())
     torch.testing.assert_close(sac.target.head, 0.9 * before + 0.1 * sac.critic.head)
+    assert not sac.target.head.requires_grad  # or it would hold the graph of every update
 
 
 def test_a_terminal_transition_does_not_look_ahead():
