@@ -1,8 +1,9 @@
 """Open a release: the one gate through which everything that is read of it comes.
 
 `Release.open` reads the manifest once, bounded, and compares its digest with one from outside if there is one. From
-there on, lists are compared with the manifest and files with the lists as they are read, and nothing is read twice. A
-release in the making has no manifest yet, or an older one; it opens by its recipes and records.
+there on, lists are compared with the manifest and whole files with the lists as they are read (parts of files have
+checksums alone), and nothing is read twice. A release in the making has no manifest yet, or an older one; it opens by
+its recipes and records.
 """
 
 from __future__ import annotations
