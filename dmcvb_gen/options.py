@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar
 
-from annotated_types import Ge
+from annotated_types import Ge, Lt
 
 from dmcvb_gen.errors import DmcvbError
 
@@ -37,7 +37,7 @@ Local = Location
 Names = Annotated[tuple[Location, ...], SEVERAL]
 """One name or several."""
 Count = Annotated[int, Ge(1)]
-Seed = Annotated[int, Ge(0)]
+Seed = Annotated[int, Ge(0), Lt(2**32)]
 Samples = Literal[1, 2, 4, 8]
 Span = Annotated[tuple[int, int], RANGE]
 """(first, last + 1)."""

@@ -201,7 +201,7 @@ def network(run: Run) -> dict[str, Any]:
 
 
 def check(run: Run) -> None:
-    """Refuse, before anything is written, a maze that cannot be learned, or a run that would learn nothing.
+    """Refuse, before anything is written, a maze that is too large to learn.
 
     Raises:
       DmcvbError: what is wrong and the cure.

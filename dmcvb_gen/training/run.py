@@ -11,7 +11,8 @@ A run folder holds
 The state is saved at the start, every ten minutes, at Ctrl-C and at the end, aside and renamed, so that a process that
 dies or a disk that fills up leaves the previous one. What was logged after it is dropped when a run goes on, and made
 again: with the same versions of torch and numpy, the same processor and one thread, a run of the package's own
-algorithms that was stopped or killed gives the same bits as one that never was.
+algorithms that was stopped or killed gives the same bits as one that never was, unless its task is of one's own and
+keeps a state in Python.
 """
 
 from __future__ import annotations
