@@ -19,7 +19,7 @@ from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.spec import is_maze
 from dmcvb_gen.tasks.ant_maze.task import SPAWN_NOISE
 from dmcvb_gen.tasks.base import Task
-from dmcvb_gen.training.settings import Count, Natural, NonNegative, Share
+from dmcvb_gen.training.settings import Count, Natural, Share
 
 STEP_COST = 0.1
 """Cost of a step in a maze, as the reward is 0 in the whole goal cell; lying on the back costs 1 more."""
@@ -44,20 +44,6 @@ class EpisodeSettings:
     train_episode_steps: Natural = 0
     standing_starts: Share = 0.0
     low_spawn_fraction: Share = 0.0
-
-
-@dataclass(frozen=True)
-class RewardedEpisodeSettings(EpisodeSettings):
-    """How training episodes go whose rewards are learned from.
-
-    Attributes:
-      shaping: weight of the task's shaping term added to the training reward.
-      path_reward_scale: mazes: weight of the meters of shortest path covered in a step, added to the training reward.
-        DMC-VB's own reward is flat in the whole goal cell.
-    """
-
-    shaping: NonNegative = 0.0
-    path_reward_scale: NonNegative = 0.0
 
 
 def shaping_of(task: Task) -> Callable[[np.ndarray], np.ndarray]:
@@ -136,8 +122,7 @@ class Episodes:
         self._task, self._settings, self._seed, self._rng = task, settings, seed, rng
         self.size, self._limit = settings.simulations, settings.train_episode_steps or task.max_steps
         self._batch, self.steps = task.batch(self.size), 0
-        aids = settings if isinstance(settings, RewardedEpisodeSettings) else RewardedEpisodeSettings()
-        self._shaping, self._path_scale = aids.shaping, aids.path_reward_scale
+        self._shaping, self._path_scale = (getattr(settings, name, 0.0) for name in ("shaping", "path_reward_scale"))
         self._shape = shaping_of(task) if self._shaping else None
         if self._path_scale:
             self._batch.track_paths()  # type: ignore[attr-defined]  # mazes have paths

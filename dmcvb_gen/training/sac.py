@@ -30,7 +30,7 @@ from torch import nn
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.header import LOG_STD_RANGE, PolicyHeader
-from dmcvb_gen.training.episodes import Episodes, Moment, RewardedEpisodeSettings
+from dmcvb_gen.training.episodes import Episodes, EpisodeSettings, Moment
 from dmcvb_gen.training.networks import Actor
 from dmcvb_gen.training.run import Run, start_from
 from dmcvb_gen.training.settings import Count, Decay, Hidden, Natural, NonNegative, Positive, Share
@@ -39,7 +39,7 @@ from dmcvb_gen.training.settings import Count, Decay, Hidden, Natural, NonNegati
 
 
 @dataclass(frozen=True)
-class ReplaySettings(RewardedEpisodeSettings):
+class ReplaySettings(EpisodeSettings):
     """Settings of a learner with a replay buffer.
 
     Attributes:
@@ -53,6 +53,9 @@ class ReplaySettings(RewardedEpisodeSettings):
       greedy_fraction: share of the simulations that act by the mean, as data are made: a policy that only ever collects
         with noise never sees the places where its mean stands still.
       compile: compile the updates. Without a C++ compiler a warning says that they run uncompiled.
+      shaping: weight of the task's shaping term added to the training reward.
+      path_reward_scale: mazes: weight of the meters of shortest path covered in a step, added to the training reward.
+        DMC-VB's own reward is flat in the whole goal cell.
     """
 
     warmup_steps: Natural = 5000
@@ -64,6 +67,8 @@ class ReplaySettings(RewardedEpisodeSettings):
     discount: Decay = 0.99
     greedy_fraction: Share = 0.0
     compile: bool = True
+    shaping: NonNegative = 0.0
+    path_reward_scale: NonNegative = 0.0
 
 
 @dataclass(frozen=True)
