@@ -104,7 +104,7 @@ def _checked(name: str, value: Any, annotation: Any) -> Any:
 
     _, marks = parts_of(annotation)
     taken = value
-    if SEVERAL in marks and isinstance(value, Iterable):
+    if SEVERAL in marks and isinstance(value, Path | Iterable):
         taken = (value,) if isinstance(value, str | Path) else tuple(value)
     try:
         taken = pydantic.TypeAdapter(annotation).validate_python(taken)
