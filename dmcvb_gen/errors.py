@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
+import copyreg
 import difflib
 from collections.abc import Iterable
 
 MOST_LISTED = 24
 """Names that a message lists at most; of more, it lists the nearest."""
-
-
-def _made_again(kind: type[Exception], *arguments: object) -> Exception:
-    """An error from its class and arguments, without its constructor."""
-    return kind.__new__(kind, *arguments)
 
 
 class DmcvbError(Exception):
@@ -43,7 +39,7 @@ class UnknownNameError(DmcvbError, KeyError):
         return str(self.args[0])
 
     def __reduce__(self) -> tuple:  # to come back from a worker process, made anew from its message
-        return _made_again, (type(self), *self.args)
+        return copyreg.__newobj__, (type(self), *self.args)  # type: ignore[attr-defined]  # typeshed lacks it
 
 
 class PolicyFileError(DmcvbError):

@@ -76,8 +76,6 @@ def cluster():
 
 NOT_BEGUN = {"only", "episode_range"}  # whole recipes are begun
 BEGUN = {heading: tuple(one for one in names if one not in NOT_BEGUN) for heading, names in OPTION_GROUPS.items()}
-
-
 BEGIN = ("tasks", "other_versions", *sum(BEGUN.values(), ()))
 
 

@@ -14,9 +14,7 @@ TICKS_A_FRAME = 10
 
 def ping_pong(start: int, direction: int, moves: np.ndarray, length: int) -> np.ndarray:
     """Frame index after `moves` moves from `start`, turning at both ends of a video of `length` frames."""
-    if length == 1:
-        return np.zeros_like(moves)
-    period = 2 * (length - 1)
+    period = max(1, 2 * (length - 1))
     phase = (start if direction > 0 else period - start) + moves
     place = phase % period
     return np.where(place < length, place, period - place)

@@ -34,7 +34,7 @@ from dmcvb_gen.generate.render import (
     renderers,
     videos_of,
 )
-from dmcvb_gen.generate.resolve import code_of_distractor, code_of_task, stream_names
+from dmcvb_gen.generate.resolve import code_of_distractor, code_of_task
 from dmcvb_gen.generate.works import Setting, Work
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, random_policy
@@ -204,7 +204,7 @@ def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episod
         _policies(record.task, files, tuple(policy.digest for policy in record.policies)),
         list(work.episodes),
         makes["seed"],
-        stream_names(work.trajectories),
+        tuple(work.trajectories.makes["streams"]),
         deterministic=record.deterministic,
         goal_pairs=pairs,
         episodes_per_goal=makes["episodes_per_goal"],
@@ -241,8 +241,8 @@ def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) 
 
 
 def _drawn_labels(work: Work, record: SubsetRecord, episodes: Episodes, backgrounds: str) -> DistractorState:
-    videos = videos_of(record, backgrounds)
-    streams = (work.trajectories.makes["seed"], stream_names(work.trajectories), episodes.index)
+    videos = videos_of(record.distractor, backgrounds, record.split)
+    streams = (work.trajectories.makes["seed"], tuple(work.trajectories.makes["streams"]), episodes.index)
     return distractor_state_of(record, *streams, episodes.physics, episodes.length, videos, episodes.arrays["action"])
 
 

@@ -49,7 +49,7 @@ def open_renderer(
     Args:
       backgrounds: "builtin" or a folder of videos.
     """
-    videos = None if setting.kind == "none" else load_backgrounds(backgrounds, split)
+    videos = videos_of(setting, backgrounds, split)
     look: dict[str, Any] = {"floor_alpha": floor_alpha_for(task, setting), "samples": samples}
     return make_renderer(name, task, size, backgrounds=videos, **look), videos
 
@@ -60,9 +60,9 @@ def renderer_for(record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]
     return open_renderer(get_task(record.task), record.distractor, *look, backgrounds, record.split)
 
 
-def videos_of(record: SubsetRecord, backgrounds: str) -> Backgrounds | None:
-    """The videos of a subset; None if its distractor shows none."""
-    return None if record.distractor.kind == "none" else load_backgrounds(backgrounds, record.split)
+def videos_of(setting: DistractorSetting, backgrounds: str, split: str) -> Backgrounds | None:
+    """The videos that a distractor draws from; None without distractors."""
+    return None if setting.kind == "none" else load_backgrounds(backgrounds, split)
 
 
 class RendererCache:

@@ -149,11 +149,6 @@ def set_name(request: SubsetRequest, trajectories: str) -> str:
     return request.name.rpartition("/")[0] if shared else request.name
 
 
-def stream_names(layer: Layer) -> tuple[str, ...]:
-    """Names of the random streams of a set of trajectories."""
-    return tuple(layer.makes["streams"])
-
-
 def file_records(files: Mapping[str, Path]) -> tuple[FileRecord, ...]:
     """Records of files of this machine, by their paths in the release."""
     return tuple(file_facts(files[path]).at(path) for path in sorted(files))

@@ -24,7 +24,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
-from dmcvb_gen.generate.resolve import all_pictures, drawn_labels, stream_names
+from dmcvb_gen.generate.resolve import all_pictures, drawn_labels
 from dmcvb_gen.loaders.arrays import ComputedArray
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
@@ -242,7 +242,7 @@ class PaintedSubset(SubsetReader):
             self._drawn.popitem(last=False)
 
     def _fresh_labels(self, episodes: list[int], physics: np.ndarray, length: np.ndarray) -> DistractorState:
-        names, (_, videos) = (*stream_names(self.trajectories), f"epoch {self.epoch}"), self._open_painter()
+        names, (_, videos) = (*self.trajectories.makes["streams"], f"epoch {self.epoch}"), self._open_painter()
         streams = (self.record, int(self.trajectories.makes["seed"]), names, np.array(episodes))
         return distractor_state_of(*streams, physics, length, videos, self.read("action", episodes))
 

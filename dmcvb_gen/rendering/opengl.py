@@ -80,9 +80,7 @@ class OpenglRenderer(Renderer):
 
     name = "opengl"
 
-    @classmethod
-    def unavailable(cls):
-        return unavailable()
+    unavailable = staticmethod(unavailable)
 
     def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
         check_size(size)

@@ -8,16 +8,13 @@ What is computed for up to CHUNK places of a picture lies in `s` (ROWS * CHUNK,)
 painter's loops run over the places of a row, written so that the compiler turns them into vector code. numba's own
 indexing wraps around and says nothing about arrays that overlap, and either keeps LLVM from making vector code; `get`,
 `put` and `distinct` do not. Every operation stands alone (no reassociation, no contraction), so that a place's bits
-depend neither on the processor nor on its neighbors. `call` keeps what is compiled on disk.
+depend neither on the processor nor on its neighbors. What `entry` compiles is kept on disk.
 """
 
 from __future__ import annotations
 
 import hashlib
-import logging
-import time
 from pathlib import Path
-from typing import Any
 
 from llvmlite import ir
 from numba import njit, types
@@ -93,18 +90,6 @@ def distinct(typing):
 
 
 # -- compiled code ---------------------------------------------------------------------------------
-_log = logging.getLogger(__name__)
-
-
-def call(function: Any, *arguments: Any) -> None:
-    """Call an entry point; say so if it is compiled first."""
-    first, started = not function.signatures, time.perf_counter()
-    function(*arguments)
-    if first and sum(function.stats.cache_misses.values()):
-        seconds = time.perf_counter() - started
-        _log.info("compiled the painter in %.0f s; later runs read it from %s", seconds, function.stats.cache_path)
-
-
 # -- columns of `rec`: what a look says of a geom
 KIND = 0  # of `scene`: PLANE, SPHERE, CAPSULE, ...
 SIZE = 1  # 3: half lengths, as MuJoCo's

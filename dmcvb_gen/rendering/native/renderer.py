@@ -14,7 +14,6 @@ from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering.base import Renderer, Views, check_frames, check_size, empty_labels, moved_lamps
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.frame import Frames, SceneConstants, label_frames, make_scratch, paint_frames
-from dmcvb_gen.rendering.native.layout import call
 from dmcvb_gen.rendering.native.scene import PLANE, SUN_DISTANCE, Scene, records_of, scene_of
 from dmcvb_gen.rendering.native.textures import SKY_WIDTH, Textures
 from dmcvb_gen.rendering.native.visibility import sample_rays
@@ -84,7 +83,7 @@ class NativeRenderer(Renderer):
             pictures = [np.empty((len(rows) * asked, *shape[1:]), np.uint8) for asked in (shown, hidden)]
             for column, view in enumerate(indices):
                 frames, scene = self._frames(poses, exogenous[rows], view), self._constants(view)
-                call(paint_frames, scene, frames, self._scratch, self._stays, *pictures)
+                paint_frames(scene, frames, self._scratch, self._stays, *pictures)
                 for whole, part in zip(out, pictures, strict=True):
                     if len(part):
                         whole[rows, column] = part
@@ -101,7 +100,7 @@ class NativeRenderer(Renderer):
             geom = np.empty((len(rows), self.size, self.size), np.int16)
             for column, view in enumerate(indices):
                 frames, scene = self._frames(poses, exogenous[rows], view), self._constants(view, centers=True)
-                call(label_frames, scene, frames, self._scratch, deep, geom)
+                label_frames(scene, frames, self._scratch, deep, geom)
                 depth[rows, column], segmentation[rows, column] = deep, numbers[geom]
         return {"depth": depth, "segmentation": segmentation}
 

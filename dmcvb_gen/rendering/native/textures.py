@@ -14,7 +14,7 @@ import numpy as np
 
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering.native import layout as L
-from dmcvb_gen.rendering.native.layout import call, distinct, entry, get, leaf, part, put
+from dmcvb_gen.rendering.native.layout import distinct, entry, get, leaf, part, put
 
 f4, i4 = np.float32, np.int32
 BITS = 22
@@ -104,7 +104,7 @@ def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.nd
         sizes = {"narrow": SKY_WIDTH * SKY_WIDTH, "tall": SKY_WIDTH * SKY_WIDTH, "all": total}
         room.update({name: np.empty(size, np.int32) for name, size in sizes.items()})
     across, down = taps(columns, SKY_WIDTH), taps(rows, SKY_WIDTH)
-    call(make_sky, np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], out := room["all"])
+    make_sky(np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], out := room["all"])
     at, side = 0, SKY_WIDTH
     while side % 2 == 0:
         at, side = at + side * side, side // 2
