@@ -155,11 +155,13 @@ def make(
 
     from dmcvb_gen.generate.request import EPISODES
     from dmcvb_gen.loaders import UnionReader, open_for_reading
+    from dmcvb_gen.tasks import typed_task
 
     try:
         task, level, setting = name.rsplit("/", 2)
     except ValueError:
         raise DmcvbError(f"{name!r} names no subset; give TASK/LEVEL/SETTING: walker-walk/expert/dynamic") from None
+    task = typed_task(task)
     name = subset_name(task, level, setting)
     if release is not None:
         if options:

@@ -52,7 +52,6 @@ class Registry(Generic[Thing]):
     def all(self) -> Mapping[str, Thing]:
         """All things by name, this package's first."""
         if not self._loaded:
-            self._loaded = True
             package = importlib.import_module(self.package)
             for module in pkgutil.iter_modules(getattr(package, "__path__", ())):
                 importlib.import_module(f"{self.package}.{module.name}")
@@ -62,6 +61,7 @@ class Registry(Generic[Thing]):
                 except Exception as error:  # one broken package must not stop all others
                     _log.warning("%s %s (%s) cannot be loaded: %s", self.kind, entry.name, entry.value, error)
             import_plugins()
+            self._loaded = True
         return self._things
 
     def get(self, name: str) -> Thing:

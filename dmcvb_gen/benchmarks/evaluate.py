@@ -31,7 +31,8 @@ from dmcvb_gen.generate.inputs import BUILTIN, shown_videos
 from dmcvb_gen.generate.recipe import NATIVE
 from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.generate.render import open_renderer
-from dmcvb_gen.options import Count, Seed, Split, checked
+from dmcvb_gen.generate.request import background_source
+from dmcvb_gen.options import Count, Location, Seed, Split, checked
 from dmcvb_gen.policies.evaluation import goal_scores
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import LEVELS, GoalMode, SubsetSpec, parse_setting, task_folder
@@ -71,7 +72,7 @@ class Score:
       success: share of the episodes that the task ended (mazes), else None.
       speed: mean speed towards the goal of the successful episodes, m/s (mazes), else None (`goal_scores`).
       limit: agent steps after which an episode was cut.
-      normalized: the mean, 0 for random actions and 100 for the data's expert; None where one of them is unknown.
+      normalized: the mean, 0 for random actions and 100 for the data's expert; None without data, or if one is unknown.
       pictures: (frame, size, size, 3) uint8, the first episode at even intervals; None for agents that see states.
     """
 
@@ -314,7 +315,7 @@ def evaluate(
     size: int | None = None,
     renderer: str | None = None,
     samples: int | None = None,
-    backgrounds: str | None = None,
+    backgrounds: Location | None = None,
     split: Split = SPLIT,
     action_repeat: Literal[1, 2, 4] | None = None,
     max_steps: Count | None = None,
@@ -353,6 +354,7 @@ def evaluate(
         bounds, or observations or actions of another kind or size than the policy's.
     """
     pixels = _own_value(policy, "pixels", pixels, True)
+    backgrounds = None if backgrounds is None else background_source(backgrounds)
     shown: dict[str, Any] = dict(stack=stack, size=size, renderer=renderer, samples=samples, backgrounds=backgrounds)
     for name, value in shown.items():
         if value is not None and not pixels:

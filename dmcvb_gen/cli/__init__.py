@@ -43,7 +43,7 @@ GROUPS = {
     },
     "Share": {
         "card": ("view:card", "Write the card of a release: README.md, croissant.json, images."),
-        "publish": ("release:publish", "Upload a release: s3://, gs://, hf:// or any fsspec URL."),
+        "publish": ("release:publish", "Upload a release: s3://, gs://, az://, hf:// or file:."),
         "fetch": ("paint:fetch", "Download a published release, or a part of it."),
     },
     "Convert": {

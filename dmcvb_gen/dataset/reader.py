@@ -354,10 +354,9 @@ class Subset:
     def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
         """The stored labels of the distractors, leading shape (episode, step); see `read`."""
         names = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in self.arrays]
-        values = {name: self.read(f"exogenous/{name}", episodes) for name in names}
-        if "material_rgb" not in values:  # of a task without materials
-            values["material_rgb"] = np.zeros((*values["style"].shape, 0, 3), np.float32)
-        return DistractorState(**values)
+        if not names:
+            raise StoreError(f"{self.name} was imported and has no labels; ask for subsets that were rolled out")
+        return DistractorState(**{name: self.read(f"exogenous/{name}", episodes) for name in names})
 
     def episode(self, index: int, arrays: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """One episode, cut to its length L.

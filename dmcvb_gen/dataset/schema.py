@@ -88,7 +88,7 @@ def label_arrays(task: Any, varying: Collection[str] = ()) -> tuple[ArraySpec, .
             dims=LABEL_DIMENSIONS[name],
         )
         for name, dtype in LABEL_DTYPES.items()
-        if OPTIONAL_LABELS.get(name, "") in ("", *varying) and all(sizes[axis] for axis in LABEL_DIMENSIONS[name])
+        if OPTIONAL_LABELS.get(name, "") in ("", *varying)
     )
 
 

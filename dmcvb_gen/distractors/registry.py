@@ -36,8 +36,10 @@ def typed_setting(name: str) -> str:
         return name
     own, _, difficulty = rest.partition("_")
     own_code.refuse_file("distractor", name)
+    if own.lower() in DISTRACTOR_KINDS:
+        raise DmcvbError(f"{name} has the name of the package's own {own.lower()}; give the class another")
     try:
-        DistractorSetting("static", difficulty or "medium")
+        DistractorSetting("dynamic", difficulty or "medium")
     except UnknownNameError as error:
         raise DmcvbError(f"{name}: a difficulty follows an underscore, so classes have none; {error}") from None
     own_code.allow([f"{module}:{own}"], own_code.DISTRACTORS)

@@ -249,7 +249,6 @@ def _drawn_labels(work: Work, record: SubsetRecord, episodes: Episodes, backgrou
 def _stored_labels(work: Work, layer: Layer, episodes: Episodes) -> DistractorState:
     arrays = read_shard(work, layer, [spec.name for spec in layer.arrays])
     arrays = {name.removeprefix("exogenous/"): values for name, values in arrays.items()}
-    arrays.setdefault("material_rgb", np.zeros((*arrays["style"].shape, 0, 3), np.float32))
     return DistractorState(**arrays)[:, : int(episodes.length.max()) + 1]
 
 

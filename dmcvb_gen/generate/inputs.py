@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import FileRecord, SubsetRecord
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import load_backgrounds
@@ -113,12 +114,18 @@ def shown_videos(subset: Subset, moved: str | None = None) -> str:
     Args:
       moved: folder of the videos, instead of the manifest's.
     """
-    release, record = subset.release, subset.record
-    if record.distractor.kind != "none":
+    release, record = subset.release, whose_videos(subset.release, subset.record)
+    if subset.record.distractor.kind != "none":
         moved = moved or subset.other_videos
     if moved or (record.backgrounds or {}).get("source", BUILTIN) == BUILTIN:
         return moved or BUILTIN
-    return video_source(local_inputs(release.store, release.inputs_of([subset.name])), record)
+    return video_source(local_inputs(release.store, release.inputs_of([record.name])), record)
+
+
+def whose_videos(release: Release, record: SubsetRecord) -> SubsetRecord:
+    """The subset whose videos one is painted with: itself, or if it shows none, the release's first with its own."""
+    own = (other for other in release.manifest.subsets if (other.backgrounds or {}).get("source", BUILTIN) != BUILTIN)
+    return record if record.backgrounds else next(own, record)
 
 
 def video_source(root: str | Path, record: SubsetRecord, moved: str | None = None) -> str:

@@ -198,6 +198,8 @@ def _shards(request: SubsetRequest) -> int:
 def _request(pattern: SubsetPattern, task: Task, spec: SubsetSpec) -> SubsetRequest:
     name, level, setting = spec.name, spec.level.value, spec.setting
     per_goal, max_steps = None, pattern.max_steps or task.max_steps
+    if task.ends_itself and max_steps > task.max_steps:
+        raise RecipeError(f"{name}: {task.id} ends its episodes after {task.max_steps} steps; give no more max_steps")
     if setting == FIXED:
         episodes, per_goal = pattern.fixed_goals * pattern.episodes_per_goal, pattern.episodes_per_goal
     elif pattern.episodes is not None and pattern.steps is not None:
@@ -318,6 +320,8 @@ def check_options_used(recipe: Recipe, given: Collection[str]) -> None:
       given: options of `dmcvb-gen rollout`, with underscores: "backgrounds", "split", "sample", "independent".
     """
     subsets = [(t, level, s) for p in recipe.subsets for t in p.tasks for level in p.levels for s in p.settings]
+    for task, _, _ in subsets:
+        get_task(task)  # a wrong name is told before its settings are
     videos = any(parse_setting(task, setting)[0].shows_videos for task, _, setting in subsets)
     mazes = {is_maze(task) for task, _, _ in subsets}
     cures = {

@@ -19,7 +19,7 @@ from dmcvb_gen.dataset.writer import begin, finish, put, put_record, write_prove
 from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.executors import run_works
-from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
+from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files, whose_videos
 from dmcvb_gen.generate.paint import bare, not_imported, recipe_after
 from dmcvb_gen.generate.render import check_renderer
 from dmcvb_gen.generate.resolve import (
@@ -139,8 +139,9 @@ def _repainted(
     """The record and layers of a repainted subset; its policies and videos are added to `files`."""
     trajectories = bare(release.layers[old.layers[0]])
     setting = _new_setting(old, request.distractor)
-    root = local_inputs(release.store, release.inputs_of([old.name]))
-    source = request.backgrounds or _own_videos(release, root, old)
+    shown = whose_videos(release, old)
+    root = local_inputs(release.store, release.inputs_of([old.name, shown.name]))
+    source = request.backgrounds or _own_videos(release, root, shown)
     backend, samples = request.renderer or old.renderer["name"], request.samples
     if samples is None and backend == old.renderer["name"]:
         samples = cast("int | None", old.renderer.get("samples"))

@@ -27,7 +27,7 @@ from dmcvb_gen.spec import (
     is_maze,
     task_folder,
 )
-from dmcvb_gen.tasks import typed_task
+from dmcvb_gen.tasks import get_task, typed_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.text import as_names
 
@@ -106,16 +106,15 @@ def behaviour_source(given: str | Path | None) -> str | None:
 def _settings(given: Mapping[str, Any]) -> tuple[list[str], int | None]:
     """The settings that were asked for, and the number of goals of "fixed3"."""
     goals, count = [], None
-    for goal in given.get("goals", ()):
+    for goal in dict.fromkeys(given.get("goals", ())):
         if found := _GOAL.fullmatch(goal):
             goal, count = FIXED, int(found[1])
         if goal not in GOAL_MODES:
             raise UnknownNameError("goal", goal, (*GOAL_MODES, f"{FIXED}N"))
+        if goal in goals:
+            raise RecipeError(f"--goal {FIXED} is given twice; keep one")
         goals.append(goal)
-    return [
-        *(DistractorSetting.parse(name).name for name in given.get("distractors", ())),
-        *dict.fromkeys(goals),
-    ], count
+    return [*(DistractorSetting.parse(name).name for name in given.get("distractors", ())), *goals], count
 
 
 def _renderer(given: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
@@ -131,6 +130,8 @@ def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[s
     """The recipe of tasks of one family, with the counts that `override` then changes."""
     for level in levels:
         Level.parse(level)
+    for task in tasks:
+        get_task(task)  # a wrong name is told before its settings are
     mazes = {is_maze(task) for task in tasks}
     if len(mazes) > 1:
         raise RecipeError("mazes and locomotion tasks take different settings; roll them out by a --recipe")

@@ -12,6 +12,7 @@ is said before hours are spent.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,13 +45,14 @@ from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD, NATIVE, Recipe
 from dmcvb_gen.generate.render import check_renderer, renderer_for
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.own_code import is_own, source_digest
-from dmcvb_gen.policies.bundled import resolve_policies
+from dmcvb_gen.policies.bundled import check_level, resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.spec import SPLITS, DistractorSetting, is_maze
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.environment import model_digest
 
 _log = logging.getLogger(__name__)
 
@@ -217,8 +219,11 @@ def labels_layer(record: SubsetRecord, trajectories: Layer) -> Layer:
 
 
 def code_of_task(task: str) -> str:
-    """The digest of the file of a task of one's own, else ""."""
-    return source_digest(task.partition(":")[0]) if is_own(task) else ""
+    """The digest of the file and the model of a task of one's own, else ""."""
+    if not is_own(task):
+        return ""
+    found = source_digest(task.partition(":")[0]) + model_digest(get_task(task).model)
+    return hashlib.sha256(found.encode()).hexdigest()
 
 
 def code_of_distractor(setting: DistractorSetting) -> list[str]:
@@ -256,7 +261,8 @@ def image_layers(
 def modality_layers(record: SubsetRecord, labels: Layer, modalities: Iterable[str]) -> Iterator[Layer]:
     """The layers of modalities of a subset's images: "depth", or "depth/<view>" if its task has several views."""
     for modality in map(get_modality, modalities):
-        dims = ("direction",)[: len(modality.shape)]
+        axes = [f"{modality.name}_{axis}" for axis in range(len(modality.shape))]
+        dims = ["direction"] if modality.name == "flow" else axes
         makes: dict[str, Any] = {"of": labels.key, "renderer": record.renderer}
         makes |= {"modality": modality.name, "hidden_goal": record.hidden_goal}
         for name in view_arrays(modality.name, record.views):
@@ -307,7 +313,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
         episodes_per_goal=request.episodes_per_goal,
         split=recipe.split,
         joints=tuple(model.joint(number).name for number in range(model.njnt)),
-        actuators=tuple(model.actuator(number).name for number in range(model.nu)),
+        actuators=tuple(model.actuator(n).name for n in range(model.nu)) if model.nu == task.action_size else (),
     )
 
 
@@ -325,8 +331,7 @@ def _tell_of_held_actions(recipe: Recipe, subsets: Iterable[SubsetRecord]) -> No
 
 def _policy_record(path: Path, task: Task, asked: SubsetRequest) -> PolicyRecord:
     policy = load_policy(path, task, sample=not asked.deterministic)
-    if policy.header.level not in (None, asked.level):
-        raise RecipeError(f"{path} is a policy of level {policy.header.level}, not {asked.level}; ask for that --level")
+    check_level(path, policy.header, asked.level)
     header = policy.header.model_dump(mode="json")
     header["training"].pop("curve", None)  # long, and in the policy's file
     if policy.header.algorithm == OWN_CODE:

@@ -28,7 +28,7 @@ def evaluate_behaviour(
       tasks (TASK): Tasks, or text files of mazes; by default those of the policies.
       levels: expert, medium, mixed, random. [default: all bundled]
       behaviour (BEHAVIOUR): What to evaluate instead of the bundled policies, as in rollout.
-      episodes: Fresh episodes of each policy.
+      episodes: Fresh episodes of each level; mixed rounds up to a multiple of its policies.
       seed: Random seed of the episodes.
       sample: Sample actions instead of using the policy mean.
 
@@ -51,17 +51,21 @@ def evaluate_behaviour(
     from dmcvb_gen.tasks import get_task, typed_task
 
     behaviour, typed = behaviour_source(behaviour), tuple(map(typed_task, as_names(tasks)))
-    _check_levels(as_names(levels), behaviour, sample)
+    named = tuple(dict.fromkeys(as_names(levels)))
+    _check_levels(named, behaviour, sample)
     refuse("a function of your own draws by itself", sample=sample and is_own(behaviour or ""))
-    chosen, asked = _of_behaviour(behaviour, typed, as_names(levels)) if behaviour else (typed, as_names(levels))
-    chosen = chosen or tuple(dict.fromkeys(name.split("/")[0] for name in bundled_digests()))
+    chosen, asked = _of_behaviour(behaviour, typed, named) if behaviour else (typed, named)
+    if not chosen:
+        known = dict.fromkeys(name.split("/")[0] for name in bundled_digests())
+        chosen = [task for task in known if {*asked, "random"} <= {*bundled_levels(task), "random"}]
     rows = []
     for task_id in chosen:
         task = get_task(task_id)
         for level in asked or (*bundled_levels(task_id), "random"):
             policies = _policies(task, level, behaviour, sample)
-            out = simulate(task, policies, range(episodes), seed, (task_id, "evaluation"), deterministic=not sample)
-            row = dict(task=task_id, level=level, episodes=episodes, seed=seed)
+            count = -(-episodes // len(policies)) * len(policies)
+            out = simulate(task, policies, range(count), seed, (task_id, "evaluation"), deterministic=not sample)
+            row = dict(task=task_id, level=level, episodes=count, seed=seed)
             own = is_own(behaviour or "") and level != "random"
             mode = "own" if own else "sampled" if sample or level == "random" else "mean"  # random actions are drawn
             row |= dict(mode=mode, behaviour=behaviour if own else None, returns=return_statistics(out.returns))
@@ -101,9 +105,13 @@ def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -
 
 def _policies(task: Any, level: str, behaviour: str | None, sample: bool) -> list[Any]:
     from dmcvb_gen.policies.actor import random_policy
-    from dmcvb_gen.policies.bundled import resolve_policies
+    from dmcvb_gen.policies.bundled import check_level, resolve_policies
     from dmcvb_gen.policies.policy_file import load_policy
 
     if level == "random":
         return [random_policy(task)]
-    return [load_policy(path, task, sample) for path in resolve_policies(task.id, level, behaviour)]
+    paths = resolve_policies(task.id, level, behaviour)
+    policies = [load_policy(path, task, sample) for path in paths]
+    for path, policy in zip(paths, policies, strict=True):
+        check_level(path, policy.header, level)
+    return policies

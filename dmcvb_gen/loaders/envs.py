@@ -8,6 +8,7 @@ and one call of the renderer.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, SupportsFloat
 
 import gymnasium
@@ -24,6 +25,7 @@ from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look, open_renderer
+from dmcvb_gen.generate.request import background_source
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import (
@@ -63,7 +65,7 @@ class Scene:
       modalities: names of modalities that observations have too, e.g. "depth" and "parts"; see `generate.modalities`.
       action_repeat: control steps for which an action is held; give that of the data.
       max_steps: agent steps at which an episode is truncated; by default those of the task's online evaluation.
-      fixed_goals: number of pairs of start and goal under "fixed"; an episode takes the next one.
+      fixed_goals: number of pairs of start and goal under "fixed" (5); an episode takes the next one.
       goal_pair: under "fixed": this pair in all episodes.
       goal_seed: under "fixed": the seed that the pairs are drawn from, as a recipe's seed.
       threads: threads of the simulation; the result does not depend on them.
@@ -75,14 +77,14 @@ class Scene:
     renderer: str = "native"
     samples: Count | None = None
     split: Literal["val", "train"] = "val"
-    backgrounds: str = "builtin"
+    backgrounds: str | Path = "builtin"
     own_videos: str | None = None
     views: str | Sequence[str] | None = None
     stack: Count | None = None
     modalities: str | Sequence[str] = ()
     action_repeat: Literal[1, 2, 4] = 2
     max_steps: Count | None = None
-    fixed_goals: Count = FIXED_GOALS
+    fixed_goals: Count | None = None
     goal_pair: Index | None = None
     goal_seed: Index = 0
     threads: Count = 1
@@ -102,7 +104,7 @@ class Scene:
         spec, unused = self.spec(), []
         if spec.goal is not GoalMode.FIXED:
             unused += ["fixed_goals", "goal_pair", "goal_seed"]
-        elif self.goal_pair is not None and self.goal_pair >= self.fixed_goals != FIXED_GOALS:
+        elif self.goal_pair is not None and self.fixed_goals and self.goal_pair >= self.fixed_goals:
             raise DmcvbError(f"goal_pair is {self.goal_pair}; give 0 to {self.fixed_goals - 1}, as fixed_goals says")
         if not spec.distractor.shows_videos:
             unused.append("backgrounds")
@@ -125,7 +127,7 @@ class Scene:
 
 def _scene(task: str, distractor: str, options: Mapping[str, Any]) -> Scene:
     try:
-        scene = Scene(task, distractor, **options)
+        scene = Scene(task=task, distractor=distractor, **options)
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         raise DmcvbError(f"{first['loc'][0]} is {first['input']!r}: {first['msg']}") from None
@@ -150,8 +152,13 @@ class _Stage:
         self._first_pair = scene.goal_pair or 0
         check_size(scene.size)
         check_renderer(scene.renderer)
-        given = (scene.renderer, scene.size, scene.samples, scene.backgrounds, scene.split)
+        given = (scene.renderer, scene.size, scene.samples, background_source(scene.backgrounds), scene.split)
         self.renderer, self.backgrounds = open_renderer(self.task, self.setting, *given)
+        shown = self.backgrounds.digest if self.backgrounds and self.split == "train" else scene.own_videos
+        if scene.own_videos not in (None, shown):
+            raise DmcvbError(
+                f"{scene.backgrounds} has other videos than the data ({scene.own_videos[:12]}); give theirs"
+            )
         self.batch = self.task.batch(count, scene.threads)
         self._episodes = [(0, 0)] * count  # (seed, number) of each place
         self.frame, self.started = np.zeros(count, int), np.zeros(count, int)
@@ -173,6 +180,8 @@ class _Stage:
         }
         for modality in map(get_modality, self.modalities):
             values, (low, high) = (self.size, self.size, len(self.pictures.views), *modality.shape), modality.bounds
+            if np.issubdtype(modality.dtype, np.integer):
+                low, high = np.clip((low, high), np.iinfo(modality.dtype).min, np.iinfo(modality.dtype).max)
             observation[modality.name] = spaces.Box(low, high, values, np.dtype(modality.dtype).type)
         return spaces.Dict(observation), spaces.Box(self.task.action_low, self.task.action_high, dtype=np.float32)
 
@@ -225,7 +234,8 @@ class _Stage:
         if self.modalities:
             seen = look(self.renderer, physics, labels, shown.views, shown.hide_goal)
             for modality in map(get_modality, self.modalities):
-                observation[modality.name] = np.stack([modality.compute(view) for view in seen], axis=3)
+                values = np.stack([modality.compute(view) for view in seen], axis=3)
+                observation[modality.name] = values.astype(modality.dtype)
         return observation
 
     def _stacked(self, pixels: np.ndarray) -> np.ndarray:
@@ -262,7 +272,7 @@ class _Stage:
 def _pairs(task: Task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """The (start, goal) cells that "fixed" episodes go round."""
     if scene.goal_pair is None:
-        return fixed_pairs(as_maze(task).layout, scene.fixed_goals, scene.goal_seed)
+        return fixed_pairs(as_maze(task).layout, scene.fixed_goals or FIXED_GOALS, scene.goal_seed)
     return fixed_pairs(as_maze(task).layout, scene.goal_pair + 1, scene.goal_seed)[-1:]
 
 

@@ -17,7 +17,7 @@ def matching_environment(
 ) -> DistractedEnv | DistractedVectorEnv:
     """See `SubsetReader.environment`."""
     given = environment_options(subset, split) | {"stack": stack}
-    if (videos := shown_videos(subset)) != BUILTIN:
+    if subset.record.distractor.shows_videos and (videos := shown_videos(subset)) != BUILTIN:
         given["backgrounds"] = videos
     if repeat := options.get("action_repeat"):  # the data's time limit, in other steps
         given["max_steps"] = given["max_steps"] * subset.record.action_repeat // repeat
@@ -48,7 +48,7 @@ def environment_options(subset: Subset, split: str) -> dict[str, Any]:
         options["renderer"] = record.renderer["name"]
     if maze:
         options["views"] = list(shown(subset).views)
-    if own_videos(subset):
+    if own_videos(subset) and record.distractor.shows_videos and not subset.other_videos:
         options["own_videos"] = (record.backgrounds or {}).get("digest")
     if record.setting == FIXED:
         seed = int(subset.trajectories.makes.get("seed", 0))

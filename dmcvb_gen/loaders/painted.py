@@ -8,6 +8,7 @@ colors, before other videos, all drawn from named streams: augmentation that kee
 from __future__ import annotations
 
 import functools
+import re
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +22,7 @@ from dmcvb_gen.dataset.manifest import ArraySpec, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_of
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.generate.inputs import background_source, local_inputs
+from dmcvb_gen.generate.inputs import background_source, local_inputs, whose_videos
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
 from dmcvb_gen.generate.resolve import all_pictures, drawn_labels
@@ -116,7 +117,7 @@ class PaintedSubset(SubsetReader):
         stored = super().arrays
         unlike = set(stored_in(stored)) if self._other_frames else set()
         if self.fresh:
-            unlike |= {name for name in stored if name.startswith("exogenous/")}
+            unlike |= {name for name in stored if re.match(r"exogenous/|at\d+/", name)}
         return tuple(sorted({*stored, *self.picture_names} - unlike | set(self._fresh_specs)))
 
     def array(self, name: str) -> Any:
@@ -250,8 +251,10 @@ class PaintedSubset(SubsetReader):
         given = self.painting.backgrounds
         if given and self.painting.distractors == RESAMPLED:
             return given  # fresh distractors may show other videos
-        root = given or local_inputs(self.release.store, self.release.inputs_of([self.name]))
-        return background_source(root, self.record, given)
+        fresh = self.painting.distractors == RESAMPLED
+        shown = whose_videos(self.release, self.record) if fresh else self.record
+        root = given or local_inputs(self.release.store, self.release.inputs_of([shown.name]))
+        return background_source(root, shown, given)
 
 
 class PaintedRelease(ReleaseReader):

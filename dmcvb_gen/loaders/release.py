@@ -128,6 +128,8 @@ class SubsetReader(Subset):
 
     def batches(self, batch_size: int, **options: Any) -> Iterator[Steps]:
         """One pass over the steps in shuffled numpy batches; `options` as for `sampler.stream`."""
+        if "epoch" in options:
+            self.set_epoch(options["epoch"])  # of fresh distractors
         return stream(self, batch_size=batch_size, **options)
 
 

@@ -12,6 +12,7 @@ from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import parse_json
 from dmcvb_gen.own_code import is_own, leave_of
 from dmcvb_gen.policies.archives import bundled_digests, bundled_file
+from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.spec import TRAINED_LEVELS, MazeName, is_maze, task_folder
 from dmcvb_gen.text import quoted
 
@@ -75,11 +76,18 @@ def levels_of(behaviour: str | Path) -> list[str]:
     if path.is_file():
         from dmcvb_gen.policies.policy_file import read_header  # loads numba, which listing needs not
 
-        return [read_header(path).level or path.stem]
+        level = read_header(path).level or path.stem
+        return ["expert" if level == "random" else level]  # which would have no policy
     for folder in (path / "selected", path):
         if levels := [level for level in TRAINED_LEVELS if level_files(folder, level)]:
             return levels
     raise _nothing_in(path, None)
+
+
+def check_level(path: Path, header: PolicyHeader, level: str) -> None:
+    """Raise PolicyFileError if a policy is of another level than the one that was asked for."""
+    if header.level not in (None, level):
+        raise PolicyFileError(f"{path} is a policy of level {header.level}, not {level}; ask for that --level")
 
 
 def checkpoints(run: str | Path) -> dict[int, Path]:

@@ -134,6 +134,8 @@ def convert(
     state, data = _read(path)
     facts = None if data is None else facts_of(path, data)
     layout, body, mean = _layout(path, state)
+    if layout.algorithm == "sb3" and facts is None:
+        raise PolicyFileError(f"{path} does not say how the policy acts; give the .zip of Stable-Baselines3's save()")
     if distribution is not None and layout.distribution is not None:
         raise PolicyFileError(f"--actions has no effect: the actions of {path} are known; remove it")
     activation = activation or (facts and facts.activation) or layout.activation
@@ -175,7 +177,7 @@ def convert(
             agent_step=facts.steps if facts else 0,
             level=level,
             **network,
-            clip_observation=10.0 if normalizes else UNCLIPPED,
+            clip_observation=10.0 if normalizes and layout.algorithm != "torch" else UNCLIPPED,
             training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
         )
     except pydantic.ValidationError as error:
@@ -222,12 +224,21 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
         ) from None
     if isinstance(state, tuple | list) and state:
         state = state[0]  # CleanRL saves (actor, critics)
-    if not isinstance(state, Mapping) or not all(isinstance(value, torch.Tensor) for value in state.values()):
+    if not isinstance(state, Mapping) or not all(map(_holds_numbers, state.values())):
         raise PolicyFileError(
-            f"{path} holds no state dict of tensors; save one with torch.save(actor.state_dict(), ...)"
+            f"{path} holds no state dict of real numbers; save one with torch.save(actor.state_dict(), ...)"
         )
     arrays = {name: value.detach().to(torch.float32).numpy() for name, value in state.items()}
     return {WRAPPERS.sub("", str(name)): value for name, value in arrays.items()}, facts
+
+
+def _holds_numbers(value: Any) -> bool:
+    """Return True for a dense tensor of real numbers."""
+    import torch
+
+    if not isinstance(value, torch.Tensor) or value.layout is not torch.strided or value.is_meta:
+        return False
+    return not value.is_complex()
 
 
 # -- the parts of an actor ------------------------------------------------------------------------
@@ -239,7 +250,7 @@ def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[s
         pattern = re.compile(rf"{re.escape(layout.body)}(\d+)\.weight")
         numbers = sorted(int(found[1]) for found in map(pattern.fullmatch, state) if found)
         layers = [f"{layout.body}{number}" for number in numbers if state[f"{layout.body}{number}.weight"].ndim == 2]
-        if layers and (layout.mean is None or f"{layout.mean}.weight" in state):
+        if f"{layout.mean}.weight" in state or layers and layout.mean is None:
             layers += [layout.mean] if layout.mean else []
             used = {f"{layer}.{part}" for layer in layers for part in ("weight", "bias")}
             used |= {f"{layout.log_std}{part}" for part in ("", ".weight", ".bias")}

@@ -11,6 +11,7 @@ The code runs only if a person named it, see `own_code`.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -43,6 +44,8 @@ class RowGenerator:
         def draw(*args: Any, size: tuple[int, ...] = (), **kwargs: Any) -> np.ndarray:
             if not isinstance(size, tuple) or not size or size[0] != len(self._streams):
                 raise ValueError(f"draw with {name}(..., size=({len(self._streams)}, ...)), one row an observation")
+            if any(np.shape(value) == size for value in (*args, *kwargs.values())):
+                raise ValueError(f"{name} takes one number for all: mean + 0.1 * generator.normal(size=...)")
             rows = [getattr(stream, name)(*args, size=size[1:], **kwargs) for stream in self._streams]
             return np.stack(rows)
 
@@ -78,6 +81,7 @@ class OwnPolicy(Policy):
         self._seen, self._calls = seen, 0
         self._known = self._probe(PROBES[0])
         self.check()
+        self.digest = hashlib.sha256(digest.encode() + (self._known.round(3) + 0.0).tobytes()).hexdigest()
 
     def _probe(self, rows: Sequence[int]) -> np.ndarray:
         return self._ask(self._seen[rows], [np.random.default_rng(row) for row in rows])

@@ -53,6 +53,9 @@ def _read(path: Path) -> tuple[PolicyHeader, dict[str, np.ndarray], str]:
     try:
         size = int.from_bytes(data[:8], "little")
         metadata = parse_json(data[8 : 8 + size]).get("__metadata__", {})
+        version = parse_json(metadata["header"].encode()).get("format_version", 0)
+        if version > FORMAT_VERSION:
+            raise PolicyFileError(f"{path} has format version {version}; install a newer dmcvb-gen")
         header = PolicyHeader.model_validate_json(metadata["header"])
         weights = load_safetensors(data)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -63,8 +66,6 @@ def _read(path: Path) -> tuple[PolicyHeader, dict[str, np.ndarray], str]:
         raise PolicyFileError(
             f"{path} is not a whole policy file ({reason}); copy it again or export it with select-checkpoints"
         ) from None
-    if header.format_version > FORMAT_VERSION:
-        raise PolicyFileError(f"{path} has format version {header.format_version}; install a newer dmcvb-gen")
     return header, weights, hashlib.sha256(data).hexdigest()
 
 

@@ -164,6 +164,7 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
     labels = [name for name in DISTRACTOR_STATE_NAMES if shows and f"exogenous/{name}" in subset.arrays]
     numbers = ["state", "action", "reward", "seed", "terminated"]
     values = subset.episode(index, [*numbers, *(f"exogenous/{name}" for name in labels), *pictures.arrays])
+    earned = np.concatenate([[0], np.cumsum(values["reward"], dtype=float)])
     actuators = [name or f"action {n}" for n, name in enumerate(subset.record.actuators)]
     actuators = actuators or [f"action {n}" for n in range(values["action"].shape[1])]
     return {
@@ -179,7 +180,7 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
         "shard": [span.start, min(span.stop, subset.record.episodes)],
         "frames": {view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
         "curves": {
-            "reward": [_curve("reward", values["reward"]), _curve("return so far", np.cumsum(values["reward"]))],
+            "reward": [_curve("reward", values["reward"]), _curve("return so far", earned)],
             "action": [_curve(name, column) for name, column in zip(actuators, values["action"].T, strict=True)],
             "state": [_curve(name, column) for name, column in _state_columns(subset, values["state"])],
             "distractor": [

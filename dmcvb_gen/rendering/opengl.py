@@ -197,7 +197,13 @@ class OpenglRenderer(Renderer):
         return self._painter.render()
 
     def close(self) -> None:
+        if self._painter._gl_context:
+            self._painter._gl_context.make_current()  # MuJoCo frees what the current one has
         self._painter.close()
+
+    def __del__(self) -> None:
+        if hasattr(self, "_painter"):
+            self.close()
 
 
 RENDERER = OpenglRenderer

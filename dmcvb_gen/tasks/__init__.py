@@ -15,7 +15,7 @@ from dmcvb_gen.own_code import allow, is_own
 from dmcvb_gen.spec import MazeName, is_maze
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, ant_maze_task
 from dmcvb_gen.tasks.ant_maze.layouts import load_layout
-from dmcvb_gen.tasks.base import ACTION_REPEAT, ACTION_REPEATS, PHYSICS_SPEC, EpisodeBatch, StepResult, Task
+from dmcvb_gen.tasks.base import ACTION_REPEAT, PHYSICS_SPEC, Task
 from dmcvb_gen.tasks.locomotion import CheetahRun, HumanoidWalk, WalkerWalk
 from dmcvb_gen.tasks.own import own_task
 from dmcvb_gen.tasks.suite import suite_ids, suite_task
@@ -40,7 +40,7 @@ def typed_task(given: str | Path | None) -> str:
     if given is None:
         raise DmcvbError("give a TASK, or the text file of a maze")
     path = Path(given).expanduser()
-    if path.suffix == ".txt" or path.is_file():
+    if path.suffix == ".txt" or path.is_file() and str(given) not in (*task_ids(), *suite_ids()):
         layout = load_layout(path)
         return str(MazeName(layout.name, layout.text))
     allow([str(given)])
@@ -68,12 +68,9 @@ def get_task(task_id: str) -> Task:
 
 __all__ = [
     "ACTION_REPEAT",
-    "ACTION_REPEATS",
     "ANT_MAZE_TASKS",
     "LOCOMOTION_TASKS",
     "PHYSICS_SPEC",
-    "EpisodeBatch",
-    "StepResult",
     "Task",
     "get_task",
     "suite_ids",

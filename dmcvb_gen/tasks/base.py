@@ -29,8 +29,6 @@ from dmcvb_gen.spec import LOCOMOTION
 
 ACTION_REPEAT = 2
 """Control steps an agent step (paper, section 3.2), unless a recipe says otherwise."""
-ACTION_REPEATS = (1, 2, 4)
-"""What recipes may ask for."""
 Generators = Sequence[np.random.Generator]
 Places = np.ndarray | Sequence[int] | None
 """Indices in a batch; None: all of it."""
@@ -116,7 +114,7 @@ class Task(abc.ABC):
     action_repeat: int = ACTION_REPEAT
     substeps: int
     views: tuple[str, ...] = ("pixels",)
-    return_range: tuple[float, float] = (0.0, 1000.0)
+    return_range: tuple[float, float] = (-math.inf, math.inf)
     observation: str = "state"
 
     cameras: tuple[int | str, ...] = (0,)
@@ -128,6 +126,8 @@ class Task(abc.ABC):
     """Fields of the state that a physics state alone does not give."""
     replayed: bool = False
     """True if a stored episode is checked by replaying its actions from its start, False if by single steps."""
+    ends_itself: bool = False
+    """True if an episode cannot be longer than `max_steps`."""
     most_at_once: int | None = None
     """Episodes that are simulated side by side at most, for their memory; None: any number."""
     physics_spec: int = PHYSICS_SPEC

@@ -9,9 +9,8 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
-import io
+import hashlib
 import math
-import pickle
 import weakref
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -42,6 +41,18 @@ BAD_STATES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in (
 """Warnings after which MuJoCo has reset a simulation; a task cannot hide them."""
 
 
+@contextlib.contextmanager
+def starting(task_id: str) -> Iterator[None]:
+    """An exception of the user's own code becomes one line."""
+    try:
+        yield
+    except DmcvbError:
+        raise
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DmcvbError(f"cannot start task {task_id} ({reason}); make it run by itself first") from error
+
+
 class EnvironmentTask(Task):
     """A task made from a dm_control `Environment` (`dm_control.rl.control`).
 
@@ -49,7 +60,7 @@ class EnvironmentTask(Task):
 
     Args:
       id: the task's name.
-      make: makes an environment; called again for every episode, unless an environment keeps nothing of an episode.
+      make: makes an environment; called again for every episode, if it is not the suite's.
       domain: dm_control's domain, for its own suite; decides the floor's opacity under distractors.
 
     Raises:
@@ -67,33 +78,21 @@ class EnvironmentTask(Task):
         self.id, self._make, self._idle = id, make, list[Any]()
         self._terrain = functools.lru_cache(maxsize=64)(self._draw_terrain)  # images come in the order of their videos
         self.floor_alpha = {"walker": 1.0, "cheetah": 1.0, "reacher": 0.0}.get(domain, 0.3)
-        self.trusted = self.reusable = bool(domain)  # the tests compare the suite's tasks with dm_control
+        self.trusted = bool(domain)  # the tests compare the suite's tasks with dm_control
         self.state_fields, self.model_entries = {}, {}
         self._fixed: dict[str, np.ndarray] = {}
-        with self._starting():
+        with starting(id):
             environment = self.make_environment(PROBE_SEEDS[0])
             self.action_low, self.action_high = _bounds(id, environment)
             self._control_steps = environment._step_limit
             self.substeps, self.control_timestep = environment._n_sub_steps, environment.control_timestep()
-        if not math.isfinite(self._control_steps):
+        self.ends_itself = math.isfinite(self._control_steps)
+        if not self.ends_itself:
             self._control_steps = DEFAULT_STEPS * self.action_repeat
         self._set_limits()
         most = float(self.action_repeat * self.max_steps)
         self.return_range = (-math.inf, math.inf) if domain in ("", "lqr") else (0.0, most)
         self._examine(environment)
-
-    @contextlib.contextmanager
-    def _starting(self) -> Iterator[None]:
-        """An exception of the user's own code becomes one line."""
-        try:
-            yield
-        except DmcvbError:
-            raise
-        except Exception as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise DmcvbError(
-                f"cannot start task {self.id} ({reason}); make its environment run in dm_control first"
-            ) from error
 
     @property
     def action_size(self) -> int:
@@ -156,7 +155,7 @@ class EnvironmentTask(Task):
             return self._make()
 
     def take_environment(self, seed: int) -> Any:
-        """An environment for an episode: a new one, or an idle one if nothing of its last episode is left in it."""
+        """An environment for an episode: a new one, or an idle one of the suite."""
         return self._idle.pop() if self._idle else self.make_environment(seed)
 
     def error(self, reason: str) -> DmcvbError:
@@ -164,7 +163,7 @@ class EnvironmentTask(Task):
 
     def give_back(self, environments: list[Any]) -> None:
         """Take environments whose episodes are over."""
-        if self.reusable:
+        if self.trusted:
             self._idle += environments
 
     # -- the check at the start -------------------------------------------------------------------
@@ -183,7 +182,7 @@ class EnvironmentTask(Task):
         if self.trusted:
             probes += [_Probe(self, environment, seed) for seed in (second, first)]
         else:
-            with self._starting():
+            with starting(self.id):
                 probes += [_Probe(self, self.make_environment(seed), seed) for seed in (second, second, first)]
             self._check_probes(probes)
         start, assets = probes[0].models[0], probes[0].assets
@@ -204,7 +203,7 @@ class EnvironmentTask(Task):
         self.give_back([environment])
 
     def _check_probes(self, probes: Sequence[_Probe]) -> None:
-        """Refuse a task whose episodes do not follow from their seeds; look whether environments can be reused."""
+        """Refuse a task whose episodes do not follow from their seeds."""
         one, two, two_again, one_again = probes
         if set(one.held) & set(two.held):
             raise DmcvbError(
@@ -216,9 +215,6 @@ class EnvironmentTask(Task):
                 f"{self.id} gives another episode for the same seed; draw every random number from self.random, and "
                 "keep nothing outside of the environment"
             )
-        first, second = PROBE_SEEDS
-        pairs = [(two, _Probe(self, one.environment, second)), (one, _Probe(self, one.environment, first))]
-        self.reusable = all(new.kept and new.kept == used.kept and not new.differs(used) for new, used in pairs)
 
     def changed_field(self, model: mujoco.MjModel) -> str | None:
         """The field of an episode's model that no short episode of the start's check changed; None if there is none."""
@@ -249,18 +245,20 @@ def model_values(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return found
 
 
+def model_digest(model: mujoco.MjModel) -> str:
+    """SHA-256 of all numbers of a model, rounded to float32, but where its assets' paths lie."""
+    found = hashlib.sha256()
+    for name, values in sorted((model_values(model) | _arrays(model, ASSETS)).items()):
+        if values.dtype.kind in "biuf" and not name.endswith("pathadr"):
+            found.update(name.encode() + np.asarray(values, np.float32).tobytes())
+    return found.hexdigest()
+
+
 def _arrays(model: mujoco.MjModel, beginnings: tuple[str, ...] = ("",)) -> dict[str, np.ndarray]:
     """Copies of a model's arrays, flat, by name."""
     names = [name for name in dir(model) if name.startswith(beginnings) and not name.startswith("_")]
     values = {name: getattr(model, name) for name in names}
     return {name: np.ravel(value).copy() for name, value in values.items() if isinstance(value, np.ndarray)}
-
-
-class _Writer(pickle.Pickler):
-    """It writes the state of a random generator, not the seed that the generator was made with."""
-
-    def reducer_override(self, thing: Any) -> Any:
-        return (dict, (thing.state,)) if isinstance(thing, np.random.BitGenerator) else NotImplemented
 
 
 class _Probe:
@@ -269,7 +267,6 @@ class _Probe:
     Attributes:
       models: the model's values after the start and after each step.
       held: states of the generators that the task held before the start.
-      kept: all that the environment keeps in Python at the end; empty if that cannot be told.
       assets: digest of the model's textures, meshes and the like at the end.
     """
 
@@ -287,17 +284,7 @@ class _Probe:
             if episode.over:
                 break
         self.models.append(model_values(episode.model))
-        self.kept = self._python_of(environment)
         self.assets = {name: zlib.crc32(value.data) for name, value in _arrays(episode.model, ASSETS).items()}
-
-    @staticmethod
-    def _python_of(environment: Any) -> bytes:
-        parts, found = {name: value for name, value in vars(environment).items() if name != "_physics"}, io.BytesIO()
-        try:
-            _Writer(found).dump(parts)  # compared, and never read
-        except Exception:  # of a user's own code; what cannot be written is not known
-            return b""
-        return found.getvalue()
 
     def changed(self, start: Mapping[str, np.ndarray]) -> set[str]:
         """Names of the model's fields that are ever other than in `start`."""
@@ -503,11 +490,11 @@ class EnvironmentBatch(EpisodeBatch):
             self._begin(sim, int(generator.integers(2**63)))
 
     def _begin(self, sim: int, seed: int) -> _Episode:
-        """A new episode in a place; its predecessor's environment is used again if that is the same as a new one."""
+        """A new episode in a place; in the suite, its predecessor's environment is used again."""
         before = self._episodes[sim]
-        if before is not None and not self.task.reusable:
+        if before is not None and not self.task.trusted:
             self._in_use.remove(before.environment)
-        if before is None or not self.task.reusable:
+        if before is None or not self.task.trusted:
             environment = self.task.take_environment(seed)
             self._in_use.append(environment)
         else:

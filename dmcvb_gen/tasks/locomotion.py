@@ -36,6 +36,7 @@ class LocomotionTask(Task):
     domain: str
     batch_class: type[LocomotionBatch]
     max_steps = evaluation_steps = EPISODE_STEPS
+    return_range = (0.0, 1000.0)
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:

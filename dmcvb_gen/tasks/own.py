@@ -7,13 +7,17 @@ Its code runs only if a person named it, see `own_code`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.own_code import TASKS, find_function
 from dmcvb_gen.tasks.base import Task
-from dmcvb_gen.tasks.environment import EnvironmentTask
+from dmcvb_gen.tasks.environment import EnvironmentTask, starting
 from dmcvb_gen.tasks.suite import import_quietly
 
 
@@ -26,10 +30,29 @@ def own_task(task_id: str) -> Task:
     import_quietly("suite")  # before the task imports it, to hide its warnings
     make = find_function(task_id, TASKS, "task")
     if isinstance(make, type) and issubclass(make, Task):
-        task = make()
-        task.id = task_id
-        return task
+        return _of_class(task_id, make)
     return EnvironmentTask(task_id, make)
+
+
+def _of_class(task_id: str, kind: type[Task]) -> Task:
+    """A task of a class, after two steps of it."""
+    with starting(task_id):
+        task = kind()
+        task.id = task_id
+        if "return_range" not in vars(kind):
+            task.return_range = (-math.inf, math.inf)  # not its parent's
+        for name in Task.__annotations__.keys() - vars(Task).keys():
+            getattr(task, name)
+        batch = task.batch(2)
+        batch.reset([np.random.default_rng(place) for place in range(2)])
+        for _ in range(2):
+            batch.step(np.zeros((2, task.action_size), np.float32))
+        if batch.state().shape != (2, task.state_size):
+            raise DmcvbError(
+                f"{task_id} gives states of shape {batch.state().shape}; let them have the sizes of state_fields: "
+                f"(2, {task.state_size})"
+            )
+    return task
 
 
 def mjcf_environment(

@@ -16,10 +16,9 @@ from dmcvb_gen.files import sha256_file
 CARDS = Path(__file__).parents[2] / "dataset_cards"
 HEAD = """# Data set cards
 
-Releases that this repository describes but does not hold. Each folder has the release's card, its Croissant
-description, a contact sheet, the report's tables if it was validated, and its manifest. The digest of a release is the
-SHA-256 of its manifest. The package has the digests of every shard by the release's name, so any part is made on your
-machine and compared:
+Releases that this repository describes but does not hold. Each folder has the release's card, a contact sheet and its
+manifest. The digest of a release is the SHA-256 of its manifest. The package has the digests of every shard by the
+release's name, so any part is made on your machine and compared:
 
 ```text
 dmcvb-gen regenerate --manifest quickstart --only '*/*/dynamic' --range 0:3 --out data/part
@@ -36,9 +35,8 @@ def row(folder: Path) -> str:
     episodes = sum(subset.episodes for subset in manifest.subsets)
     families = sorted({subset.family for subset in manifest.subsets})
     tasks = len({subset.task for subset in manifest.subsets})
-    report = f" ([report]({folder.name}/report.md))" if (folder / "report.md").exists() else ""
     return (
-        f"| [{manifest.name}]({folder.name}/README.md){report} | {manifest.version} | {len(manifest.subsets)} "
+        f"| [{manifest.name}]({folder.name}/README.md) | {manifest.version} | {len(manifest.subsets)} "
         f"| {episodes:,} | {tasks} ({', '.join(families)}) | `{sha256_file(folder / MANIFEST)[:16]}` |\n"
     )
 

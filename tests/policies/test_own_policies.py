@@ -133,7 +133,7 @@ def test_data_of_a_function_are_verified_regenerated_and_marked(task, code, tmp_
     [subset] = release.subsets.values()
     [policy] = subset.record.policies
     source = (tmp_path / f"{code}.py").read_bytes()
-    assert policy.digest == hashlib.sha256(source).hexdigest() and policy.path is None
+    assert policy.header["training"]["source_sha256"] == hashlib.sha256(source).hexdigest() and policy.path is None
     assert policy.header["training"]["note"] == "not regenerable without that code"
     alone = [*TINY, "--episodes-per-shard", 1, "--behaviour", f"{code}:noisy", "--out", tmp_path / "alone"]
     run("rollout", task.id, *alone)
@@ -141,7 +141,11 @@ def test_data_of_a_function_are_verified_regenerated_and_marked(task, code, tmp_
     np.testing.assert_array_equal(other.read("action"), subset.read("action"))
     write_card(tmp_path / "r")
     card = (tmp_path / "r" / "README.md").read_text()
-    assert f"`{code}:noisy`" in card and policy.digest in card and "not regenerable without that code" in card
+    assert (
+        f"`{code}:noisy`" in card
+        and policy.header["training"]["source_sha256"] in card
+        and "not regenerable without that code" in card
+    )
     engine._policies.cache_clear()  # as in a new process
     monkeypatch.setenv(BEHAVIOURS, "")  # and on somebody else's machine: a manifest lets no code run
     assert BEHAVIOURS in refused("regenerate", tmp_path / "r", "--check")

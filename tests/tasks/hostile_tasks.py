@@ -167,6 +167,17 @@ class CountsEpisodes(Arm):
         physics.data.qvel[:] = self.episodes
 
 
+class CountsLate(Arm):
+    wins = 0
+
+    def start(self, physics):
+        physics.data.qpos[0] = self.wins
+
+    def after_step(self, physics):
+        self.wins += 0.43 < physics.data.time < 0.45  # after what the start's check sees
+        super().after_step(physics)
+
+
 def keeps_physics():
     environment = arm()
     environment.task.get_reward = lambda physics: float(environment.physics.data.qpos[0])

@@ -190,10 +190,9 @@ def test_a_task_for_a_batch_is_refused_if_float32_does_not_hold_what_it_gives(mo
         rolled(task, [8], max_steps=2)
 
 
-@pytest.mark.slow
-def test_an_environment_is_used_again_only_if_nothing_of_an_episode_is_left_in_it():
-    for case, expected in ((h.WritesIntoTheSimulation, True), (h.DrawsItsModel, False), (h.CountsEpisodes, False)):
-        assert task_of(case).reusable is expected
+def test_what_a_task_keeps_late_in_an_episode_does_not_reach_the_next_one():
+    many, alone = rolled(task_of(h.CountsLate), range(3)), rolled(task_of(h.CountsLate), [2])
+    np.testing.assert_array_equal(many.physics[2], alone.physics[0])
 
 
 def test_terrain_that_is_drawn_otherwise_than_it_was_stored_is_refused():
