@@ -9,6 +9,7 @@ import types
 from pathlib import Path
 
 import pytest
+from huggingface_hub.errors import EntryNotFoundError
 
 from tests.web_server import give_files, serving
 
@@ -59,6 +60,8 @@ class FakeHub:
 
     def list_repo_tree(self, repo_id, path_in_repo, revision, repo_type, recursive=False):
         root = self.at(revision)
+        if not (root / (path_in_repo or "")).exists():
+            raise EntryNotFoundError("404: the folder does not exist")
         for path in sorted((root / (path_in_repo or "")).glob("**/*" if recursive else "*")):
             name = path.relative_to(root).as_posix()
             yield self._facts(name, path.read_bytes()) if path.is_file() else types.SimpleNamespace(path=name)

@@ -8,12 +8,12 @@ from pathlib import Path
 from dmcvb_gen import making
 from dmcvb_gen.cli.common import answer, moved_files
 from dmcvb_gen.cli.options import command_of
-from dmcvb_gen.dataset.manifest import VIDEOS
+from dmcvb_gen.dataset.manifest import RECIPES, VIDEOS
 from dmcvb_gen.release.export import export as run_export
 from dmcvb_gen.release.issue import NOT_PART
 from dmcvb_gen.release.publish import publish as run_publish
 from dmcvb_gen.release.verify import verify as run_verify
-from dmcvb_gen.storage.places import is_url, shown, unpinned
+from dmcvb_gen.storage.places import is_url, local_path, shown, unpinned
 from dmcvb_gen.text import pluralize, quoted
 
 
@@ -56,7 +56,7 @@ def _verified(path, result):
         planned = here + sum(planned - count for count, planned in result.incomplete.values())
         verdict += f", incomplete: {here:,} of {planned:,} episodes"
     elif result.sound and not result.finished:
-        verdict += f", not finished: dmcvb-gen cluster finish {path}"
+        verdict += f", not finished: dmcvb-gen cluster finish {quoted(path)}"
     yield f"{path}: {verdict} ({checked})"
     if result.digest:
         yield f"digest {result.digest}"
@@ -73,7 +73,9 @@ def _cures(path, places):
         yield f"`dmcvb-gen publish FOLDER {quoted(path)} --repair` replaces damaged and missing files."
         return
     videos = {place for place in places if place.startswith(VIDEOS)}
-    if places - videos:
+    if any(place.startswith(RECIPES) for place in places):
+        yield f"`dmcvb-gen fetch SOURCE --out {quoted(path)} --repair` brings recipes back."
+    if any(not place.startswith((VIDEOS, RECIPES)) for place in places):
         yield f"`dmcvb-gen regenerate {quoted(path)}` repairs damaged and missing shards."
     if videos:
         yield f"`dmcvb-gen regenerate {quoted(path)} --backgrounds FOLDER` restores the videos from FOLDER."
@@ -157,5 +159,7 @@ def export(release, to, out, as_json, **options):
     dmcvb-gen export releases/mini --to hdf5 --only '*/*/none' --out exports/h5
     """
     folders = run_export(release, to, out, **options)
-    shown = [str(Path(out) / folder.relative_to(Path(out).absolute())) for folder in folders]  # as --out names them
+    shown = [
+        str(Path(out) / folder.relative_to(local_path(out).absolute())) for folder in folders
+    ]  # as --out names them
     answer(as_json, shown, *shown)

@@ -111,11 +111,14 @@ def finish(release, storage_options, as_json, progress):
     """Write the manifest of all finished shards. Exit code 1 while shards are missing."""
     from dmcvb_gen.dataset.gate import Release
     from dmcvb_gen.dataset.writer import finish as write
+    from dmcvb_gen.errors import StoreError
     from dmcvb_gen.generate.works import missing_subsets
     from dmcvb_gen.storage.store import open_store
 
     store = open_store(release, storage_options)
     Release.in_making(store)  # or says that nothing was begun there
+    if Release.read_copy(store) is not None:
+        raise StoreError(f"{store.place} is a copy of a release, which was finished where it was made")
     done = write(store)
     missing = missing_subsets(done)
     state = "complete"

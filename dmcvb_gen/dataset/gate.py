@@ -361,10 +361,18 @@ class Release:
     @property
     def shortfalls(self) -> dict[str, tuple[int, int]]:
         """Subsets that are not whole here -> (episodes here, episodes that belong to them)."""
-        here = {record.name: 0 for record in self.manifest.subsets}
-        here |= {name: len(subset.episodes) for name, subset in self.subsets.items()}
+        here = dict.fromkeys(self._planned, 0) | {name: len(subset.episodes) for name, subset in self.subsets.items()}
+        return {name: (count, self._planned[name]) for name, count in here.items() if count < self._planned[name]}
+
+    @functools.cached_property
+    def _planned(self) -> dict[str, int]:
+        """Episodes of each subset; in the folder where a release is made, as many as its recipes ask for."""
         planned = {record.name: record.episodes for record in self.manifest.subsets}
-        return {name: (count, planned[name]) for name, count in here.items() if count < planned[name]}
+        if self.store.folder and self.copy is None and self.manifest_path == MANIFEST:
+            for recipe in read_recipes(self.store):
+                for record in recipe.subsets:
+                    planned[record.name] = max(record.episodes, planned.get(record.name, 0))
+        return planned
 
     @property
     def path(self) -> Path:

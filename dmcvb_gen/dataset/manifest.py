@@ -475,7 +475,7 @@ def parse(model: type[Parsed], text: bytes, where: str) -> Parsed:
     try:
         data = parse_json(text)
     except ValueError as error:
-        raise StoreError(f"{where} is not JSON ({error}); fetch it again, or make a new release") from None
+        raise StoreError(f"{where} is not JSON ({error}); remove it and fetch again, or make a new one") from None
     try:
         return model.model_validate(data)
     except pydantic.ValidationError as error:

@@ -120,7 +120,12 @@ def begin(store: Store, recipe: Resolved, inputs: Mapping[str, Path | bytes]) ->
                 "(--backgrounds FOLDER)"
             )
         put(store, file.path, inputs[file.path])
-    put(store, f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe))
+    put(store, path := f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe))
+    try:
+        check_agree(read_recipes(store))
+    except StoreError:  # another process began meanwhile
+        store.delete(path)
+        raise
 
 
 def _adds_images_alone(release: Release, recipe: Resolved) -> bool:
@@ -241,9 +246,11 @@ def finish(store: Store) -> Release:
             put(store, f"{MANIFESTS}{sha256_bytes(old)}.json", old)
         if store.replace(MANIFEST, text, expected=tag):
             break
-    release = Release.open(store)
-    write_plain_metadata(release)
-    return release
+    while True:
+        release = Release.open(store)
+        write_plain_metadata(release)
+        if store.version(MANIFEST) is None or Release.open(store).digest == release.digest:
+            return release  # else another process has finished more meanwhile
 
 
 def _listed_records(store: Store) -> dict[str, dict[int, ShardRecord]]:
@@ -264,9 +271,14 @@ def _leading(records: Mapping[int, ShardRecord]) -> tuple[ShardRecord, ...]:
 
 def write_plain_metadata(release: Release) -> None:
     """Write the zarr.json files of the layers that are here, for zarr and xarray; our readers never read them."""
-    texts = plain_metadata(release)
+    store, texts = release.store, plain_metadata(release)
+
+    def write(path: str) -> None:
+        if store.find(path, MANIFEST_BYTES) != texts[path]:  # so that nothing is written where nothing is new
+            store.replace(path, texts[path])
+
     with ThreadPoolExecutor(READERS) as pool:
-        list(pool.map(release.store.replace, texts.keys(), texts.values()))
+        list(pool.map(write, texts))
 
 
 def plain_metadata(release: Release) -> dict[str, bytes]:
@@ -400,4 +412,5 @@ def check_versions(store: Store) -> None:
 
 
 def _versions(made_by: Mapping[str, str]) -> str:
-    return f"dmcvb-gen {made_by.get('dmcvb-gen', '?')} with mujoco {made_by.get('mujoco', '?')}"
+    versions = (f"{name} {made_by.get(name, '?')}" for name in ("dmcvb-gen", "mujoco"))
+    return f"{' with '.join(versions)} on {made_by.get('cpu', 'an unknown processor')}"

@@ -62,7 +62,8 @@ class RayPool(Pool):
         while self._waiting or self._running:
             while self._waiting and len(self._running) < self._bound():
                 key, function, arguments = self._waiting.popleft()
-                self._running[work.remote(function, arguments, self._threads, tuple(permissions().items()))] = key
+                told = tuple(permissions().items())
+                self._running[work.remote(function, arguments, self._threads, told, os.getcwd())] = key
             done, _ = ray.wait(list(self._running), num_returns=1, timeout=10 * POLL_SECONDS)
             for reference in done:
                 key = self._running.pop(reference)
@@ -132,12 +133,17 @@ def _nobody(address: str, reason: str) -> DmcvbError:
     )
 
 
-def _work(function, arguments, threads: int, allowed: Sequence[tuple[str, str]]) -> tuple[list[tuple], Any]:
+def _work(
+    function, arguments, threads: int, allowed: Sequence[tuple[str, str]], folder: str
+) -> tuple[list[tuple], Any]:
     """Run a function and return its progress (numbers are added up) and its result.
 
     Args:
       allowed: code of the user's own that may run, see `own_code.permissions`; nodes do not inherit it.
+      folder: the current folder of who asks, which relative paths begin at.
     """
+    if os.path.isdir(folder):
+        os.chdir(folder)
     os.environ.update(dict(allowed))
     limit_threads(threads)
     told: list[tuple] = []

@@ -3,13 +3,22 @@
 Two publishers of one release create equal files; of two releases, the manifest of the one that is slower is refused.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import COPY, MANIFEST, MANIFESTS, FileRecord, canonical_json
+from dmcvb_gen.dataset.manifest import (
+    ATTACHMENT_FILES,
+    COPY,
+    MANIFEST,
+    MANIFEST_BYTES,
+    MANIFESTS,
+    FileRecord,
+    canonical_json,
+)
 from dmcvb_gen.dataset.writer import copy_of, plain_metadata, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
@@ -19,6 +28,9 @@ from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at, manifest_text
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import quoted
+
+_log = logging.getLogger("dmcvb_gen")
+README = ATTACHMENT_FILES[0]
 
 
 @checked
@@ -56,6 +68,10 @@ def _publish_release(
     release = Release.open(root, own_images=False)
     _check_complete(release, root, pixels)
     check_apart(release, store, "choose another URL")
+    if release.shortfalls and not release.copy:
+        _log.warning("%s lacks a part of %s, which stays unpublished", root, min(release.shortfalls))
+    if (card := release.store.find(README, MANIFEST_BYTES)) and str(release.digest).encode() not in card:
+        _log.warning("%s/%s is no card of this version; `dmcvb-gen card %s` writes one", root, README, root)
     text, texts = manifest_text(release), dict(attachments(release.store))
     store.begin()
     tag = store.version(MANIFEST)

@@ -82,9 +82,11 @@ def attachments(store: Store) -> Iterator[tuple[str, bytes]]:
 
 
 def grows_from(new: Release, old: Release) -> bool:
-    """Return True if every shard that an older release of that name has is one of the newer, too."""
-    if old.manifest.name != new.manifest.name:
+    """Return True if every shard that an older release of the same name or recipes has is one of the newer, too."""
+    if not isinstance(old.manifest, Manifest) or not isinstance(new.manifest, Manifest):
         return False
+    if old.manifest.name != new.manifest.name and not {*old.manifest.recipes} <= {*new.manifest.recipes}:
+        return False  # the name is that of the newest recipe
     for name, layer in old.layers.items():
         if name not in new.layers or new.layers[name].key != layer.key:
             return False
@@ -92,9 +94,7 @@ def grows_from(new: Release, old: Release) -> bool:
         if any(records.get(number) != record for number, record in old.records(name).items()):
             return False
     episodes = {record.name: record.episodes for record in new.manifest.subsets}
-    return isinstance(old.manifest, Manifest) and all(
-        record.episodes <= episodes.get(record.name, 0) for record in old.manifest.subsets
-    )
+    return all(record.episodes <= episodes.get(record.name, 0) for record in old.manifest.subsets)
 
 
 def folders_of(release: Release) -> tuple[str, ...]:

@@ -183,6 +183,8 @@ def _verification(
         counts["steps"] += subset.steps
     lacking = [subset for subset in sound if len(subset) < subset.record.episodes]
     incomplete = {subset.name: (len(subset), subset.record.episodes) for subset in lacking}
+    if not findings:
+        incomplete |= release.shortfalls
     unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
     faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
     return Verification(counts, faults, incomplete, release.digest, release.compared, unchecked, covered)
@@ -245,8 +247,11 @@ def _wrong_sizes(release: Release, files: Sequence[Listed]) -> list[Issue]:
 def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
     """Files that belong to no release."""
     known = {file.path for _, file in files} | {MANIFEST, COPY}
+    unplanned = not any(path.endswith(ZARR_JSON) for path in known)  # as something else is damaged
     folders = (RECIPES, PREVIEWS, *folders_of(release))
     for path in release.store.list() if release.manifest_path == MANIFEST else ():
+        if path.endswith(ZARR_JSON) and unplanned:
+            continue
         if path not in known and not path.startswith(folders) and not is_attachment(path):
             yield Issue("files", path, f"{NOT_PART}; move it elsewhere")
 
@@ -266,8 +271,8 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
         distractors_of(subset.record.distractor)
     except ModuleNotFoundError as error:
         # Fetch-only installs have no simulator; bytes are checked all the same, and this says what was not.
-        log.warning("values, physics and images of %s were not checked: %s is not installed", subset.name, error.name)
-        return []
+        lacks = f"values, physics and images were not checked: {error.name} is not installed"
+        return [Issue(UNCHECKED, subset.name, lacks)]
     except DmcvbError as error:  # a user's own code, which cannot be imported or does not run on this machine
         return [Issue(UNCHECKED, subset.name, f"values, physics and images cannot be checked here: {error}")]
     try:

@@ -110,9 +110,14 @@ class HubStore(Store):
         return found
 
     def _list(self, prefix: str) -> Mapping[str, int]:
+        from huggingface_hub.errors import EntryNotFoundError
+
         folder = f"{self.folder_there}{prefix}".strip("/") or None
         given = {"path_in_repo": folder, "recursive": True, "revision": self._commit_read()}
-        entries = self._api.list_repo_tree(**self._where, **given)
+        try:
+            entries = list(self._api.list_repo_tree(**self._where, **given))
+        except EntryNotFoundError:  # of a folder that is not there yet
+            return {}
         return {entry.path.removeprefix(self.folder_there): entry.size for entry in entries if hasattr(entry, "size")}
 
     # -- writing ----------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any
 
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.storage.interface import ANY, NotThere, Store
-from dmcvb_gen.storage.places import WEB, Place
+from dmcvb_gen.storage.places import WEB, Place, unpinned
 
 TAKEN = {"hf": ("endpoint", "token"), **dict.fromkeys(WEB, ("headers",))}
 """Options that places take, but for buckets, whose file systems know theirs."""
@@ -28,6 +28,8 @@ def open_store(place: str | Path, options: Mapping[str, Any] | None = None) -> S
     Raises:
       StoreError: it is no such place, its package is missing, or it takes no such options.
     """
+    if (whole := unpinned(place)) != str(place):
+        raise StoreError(f"{place}: this command takes the newest version; leave out what follows {whole}")
     parsed = Place.parse(place)
     if parsed.protocol == "file":
         from dmcvb_gen.storage.folder import LocalStore
@@ -45,7 +47,10 @@ def open_store(place: str | Path, options: Mapping[str, Any] | None = None) -> S
     if parsed.protocol in WEB:
         from dmcvb_gen.storage.web import HttpStore
 
-        return HttpStore(str(parsed), parsed.login, parsed.query, dict((options or {}).get("headers", {})))
+        headers = (options or {}).get("headers", {})
+        if not isinstance(headers, Mapping):
+            raise StoreError("headers are a dictionary, which only storage_options in Python can give")
+        return HttpStore(str(parsed), parsed.login, parsed.query, dict(headers))
     from dmcvb_gen.storage.bucket import ObjectStore
 
     return ObjectStore(parsed.protocol, parsed.path, options or {})

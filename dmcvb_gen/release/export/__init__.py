@@ -15,7 +15,7 @@ from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_p
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import get_format
 from dmcvb_gen.storage.errors import storage_errors
-from dmcvb_gen.storage.places import is_url, local_path
+from dmcvb_gen.storage.places import is_url, local_path, unpinned
 from dmcvb_gen.text import as_names
 
 STAMP = ".dmcvb-gen.json"
@@ -81,7 +81,7 @@ def export(
     kind, folder, path = get_format(to), Path(local_path(out)).absolute(), str(release)
     kind.check_installed()  # here, and not first in a worker
     source = open_for_reading(path, storage_options)
-    if not is_url(path) and Path(path).resolve() in (folder.resolve(), *folder.resolve().parents):
+    if not is_url(path) and Path(unpinned(path)).resolve() in (folder.resolve(), *folder.resolve().parents):
         raise StoreError(f"--out {folder} lies in the release itself; give another folder")
     asked = as_names(only)
     unions = [name for name in asked if source.parts_of(name)]
