@@ -15,7 +15,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np  # noqa: E402
 
 from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors  # noqa: E402
-from dmcvb_gen.rendering import make_renderer  # noqa: E402
+from dmcvb_gen.rendering import renderer_class  # noqa: E402
 from dmcvb_gen.seeding import STREAMS, episode_stream  # noqa: E402
 from dmcvb_gen.spec import is_maze  # noqa: E402
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task  # noqa: E402
@@ -63,7 +63,7 @@ def main() -> None:
             common = dict(backgrounds=load_backgrounds(), floor_alpha=floor_alpha_for(task, setting))
             frames, rates = [], []
             for choice, timed in (("opengl", some[:8]), ("native", np.arange(len(physics)))):
-                renderer = make_renderer(choice, task, options.size, **common)
+                renderer = renderer_class(choice)(task, options.size, **common)
                 frames.append(renderer.render(physics[some], labels[some]).astype(float))
                 rates.append(rate_of(renderer, task, physics[timed], labels[timed]))
                 renderer.close()

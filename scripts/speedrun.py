@@ -63,7 +63,7 @@ def main() -> None:
             if mean < goal:
                 return
             newest = max((folder / "checkpoints").glob("[0-9]*.safetensors"))
-            fresh = evaluate(load_policy(newest, task), task, EPISODES, SEED, streams=FRESH)[0].mean
+            fresh = evaluate(load_policy(newest, task), task, EPISODES, SEED, streams=FRESH).mean
             print(f"  {fresh:.0f} on {EPISODES} fresh episodes, {goal:.0f} is wanted", flush=True)
             if fresh >= goal:
                 raise Reached(fresh)

@@ -52,9 +52,9 @@ def digests(task_id: str, steps: int, renderer: str | None) -> dict[str, str]:
         labels = sample_distractors(task, distractors, physics, streams, backgrounds, split="train")
         found[f"labels {setting}"] = digest(*(value for _, value in labels.items()))
         if renderer:
-            from dmcvb_gen.rendering import make_renderer
+            from dmcvb_gen.rendering import renderer_class
 
-            painter = make_renderer(renderer, task, 64, backgrounds=backgrounds)
+            painter = renderer_class(renderer)(task, 64, backgrounds=backgrounds)
             frames = painter.render(start, labels[:, 0])
             found[f"pictures {setting}"] = digest(frames)
             painter.close()

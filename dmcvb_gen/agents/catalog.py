@@ -108,21 +108,12 @@ def parse_agent(name: str) -> Agent:
     else:
         pretrain, _, policy = base.rpartition("+")
         agent = Agent(policy, pretrain or None)
-    return _with_options(agent, options)
-
-
-def _with_options(agent: Agent, text: str) -> Agent:
-    """An agent with the options "k=5:sample".
-
-    Raises:
-      DmcvbError: one is unknown, or of another agent.
-    """
     parts = [part for part in (agent.pretrain, agent.policy) if part]
     defaults = {} if agent.sees_state else {"frames": FRAMES}
     for part in parts:
         defaults |= PARTS.get(part).options
     values: dict[str, int | bool] = {}
-    for option in filter(None, text.split(":")):
+    for option in filter(None, options.split(":")):
         key, _, value = option.partition("=")
         kind = type(defaults.get(key))
         if kind is bool and not value:

@@ -205,14 +205,9 @@ class TrainingData:
         self.lengths, self.held_out, self.returns, self.stack = table.lengths, held_out, returns, stack
 
     @property
-    def channels(self) -> int:
-        """Channels of an observation: 3 x views x frames of the stack."""
-        return self.frames.channels * self.stack
-
-    @property
     def sizes(self) -> Sizes:
         """Sizes that networks for these data need."""
-        pictures = () if self.frames is None else (self.channels, self.frames.size, self.stack)
+        pictures = () if self.frames is None else (self.frames.channels * self.stack, self.frames.size, self.stack)
         return Sizes(self.state.shape[1], self.action.shape[1], *pictures)
 
     @property
@@ -331,24 +326,12 @@ class TrainingData:
     def _to_device(self, values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(values).to(self.device)
 
-    def states_only(self) -> TrainingData:
-        """The same episodes for an agent that sees states: shares everything but the pictures."""
-        return self._with(frames=None)
-
     def with_labels(self, episodes: np.ndarray) -> TrainingData:
         """The same episodes, of which some are labeled, (episode,) bool: tests are of others."""
         labeled = self._to_device(np.repeat(episodes, self.lengths + 1))
         rows = torch.cat([self.train_rows, self.hold_out_rows])
         tests = self.hold_out_rows[~labeled[self.hold_out_rows]]
-        return self._with(labeled_rows=rows[labeled[rows]], hold_out_rows=tests)
-
-    def labeled(self) -> TrainingData:
-        """The labeled episodes of `with_labels`, to learn from."""
-        return self._with(train_rows=self.labeled_rows)
-
-    def with_stack(self, stack: int) -> TrainingData:
-        """The same episodes seen in stacks of another number of frames."""
-        return self._with(stack=stack)
+        return self.but(labeled_rows=rows[labeled[rows]], hold_out_rows=tests)
 
     @torch.no_grad()
     def encoded(
@@ -365,9 +348,10 @@ class TrainingData:
             with torch.autocast(self.device.type, torch.bfloat16, enabled=dtype == torch.bfloat16):
                 parts.append(encoder(self.observe(few, dtype=dtype)).float())
             progress((int(few[-1]) + 1) / len(rows))
-        return self._with(latent=torch.cat(parts))
+        return self.but(latent=torch.cat(parts))
 
-    def _with(self, **changes) -> TrainingData:
+    def but(self, **changes) -> TrainingData:
+        """The same episodes with other attributes: `frames=None` for agents that see states, another `stack`."""
         twin = object.__new__(TrainingData)
         twin.__dict__.update(self.__dict__ | changes)
         return twin
@@ -407,8 +391,6 @@ def choose_episodes(subset: Subset, part: Slice, seed: int) -> tuple[np.ndarray,
     names = subset.episodes
     if part.goal_pair is not None:
         names = names[subset.read("goal_pair") == part.goal_pair]
-        if not len(names):
-            raise DmcvbError(f"{subset.name} has no episodes of goal pair {part.goal_pair}")
     count = min(part.episodes or max(1, round(part.share * len(names))), len(names))
     chosen = np.random.default_rng(seed).permutation(len(names))[:count]
     few = part.episodes is not None or part.goal_pair is not None
@@ -438,7 +420,6 @@ def load_data(
     slices: Sequence[Slice],
     *,
     pixels: bool = True,
-    stack: int = FRAMES,
     seed: int = 0,
     device: str = "cpu",
     memory: int | None = None,
@@ -449,7 +430,6 @@ def load_data(
 
     Args:
       pixels: agents see pictures; else states.
-      stack: frames an observation.
       seed: seed of the episode split and of shares.
       memory: bytes of pictures to hold at most; larger data are mapped into memory from a file.
       scratch: folder of that file; the system's folder of temporary files by default.
@@ -476,4 +456,4 @@ def load_data(
     if "low" in bounds:
         table.action[:] = to_unit(table.action, *(np.array(bounds[name], np.float32) for name in ("low", "high")))
     returns = np.concatenate([part.subset.read("return", part.episodes) for part in parts])
-    return TrainingData(table, np.concatenate(held_out), stack, returns, device)
+    return TrainingData(table, np.concatenate(held_out), FRAMES, returns, device)

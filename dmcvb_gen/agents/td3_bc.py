@@ -54,18 +54,10 @@ class TD3BC(Policy):
     draws = {"next_observation": True, "pictures": False}
     compiled = ("critic_loss", "actor_loss")
     only_learns = ("target.", "net.critic", "updates")
-    gamma, noise, noise_clip, actor_every, decay = 0.99, 0.2, 0.5, 2, EMA_DECAY
+    alpha, gamma, noise, noise_clip, actor_every, decay = 2.5, 0.99, 0.2, 0.5, 2, EMA_DECAY
 
-    def __init__(
-        self,
-        encoder: nn.Module | None,
-        sizes: Sizes,
-        architecture: Architecture = PAPER,
-        frozen: bool = False,
-        alpha: float = 2.5,
-    ):
+    def __init__(self, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER, frozen: bool = False):
         super().__init__()
-        self.alpha = alpha
         if frozen:
             body, features, trunk = encoder.requires_grad_(False), encoder.features, None
         elif sizes.channels:

@@ -125,7 +125,7 @@ def draw(
     if not learner.needs_labels or hold_out:
         return batch
     common |= {"next_observation": True} | learner.draws
-    return replace(batch, labeled=data.labeled().batch(size, generator, **common))
+    return replace(batch, labeled=data.but(train_rows=data.labeled_rows).batch(size, generator, **common))
 
 
 def hold_out_losses(learner: Learner, data: TrainingData, size: int, most: int) -> dict[str, float]:

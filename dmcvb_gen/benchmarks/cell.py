@@ -174,7 +174,9 @@ class CellRun:
     def __init__(self, root: str | Path, out: str | Path, budget: Budget, cell: Cell, tick: ProgressCallback = ignore):
         self.root, self.out, self.budget, self.cell, self.tick = str(root), Path(out), budget, cell, tick
         self.release = open_data(root, budget)
-        self.mark = fingerprint(self.release, budget, cell)
+        self.mark, self.subset = fingerprint(self.release, budget, cell), self.release[cell.policy[0].subset]
+        # Encoders, and policies whose scores count; DINO's weights are a large file of the user's.
+        self.keeps_weights = cell.benchmark == ENCODER or (budget.scores and not cell.agent.sees_by_dino)
 
     def path(self, suffix: str) -> Path:
         """A file of the cell, e.g. its ".json"."""
@@ -187,7 +189,7 @@ class CellRun:
           DmcvbError: the renderer cannot start, or training does not stay finite.
         """
         done = read_result(self.path(".json"), self.mark)
-        if done and (not self._keeps_weights or self.path(".safetensors").exists()):
+        if done and (not self.keeps_weights or self.path(".safetensors").exists()):
             return done
         made = self._pretrain() if self.cell.benchmark == ENCODER else self._train()
         facts = {"id": self.cell.id, "fingerprint": self.mark, "cell": self.cell.facts()}
@@ -195,22 +197,13 @@ class CellRun:
         write_json(self.path(".json"), facts)
         return facts
 
-    @property
-    def _keeps_weights(self) -> bool:
-        """Encoders, and policies whose scores count; DINO's weights are a large file of the user's."""
-        return self.cell.benchmark == ENCODER or (self.budget.scores and not self.cell.agent.sees_by_dino)
-
-    @property
-    def _subset(self) -> Subset:
-        return self.release[self.cell.policy[0].subset]
-
     def data(self, pixels: bool = True, stack: int = 3) -> TrainingData:
         """The data of the cell's slices; painting many images takes minutes, so they are kept for the next cell."""
         budget, parts = self.budget, self.cell.policy
         digests = tuple(data_digests(self.release, self.cell).items())  # a release may have grown
         key = (self.root, parts, digests, budget.seed, budget.backgrounds, budget.device, budget.memory)
         if not pixels and (key, False) not in _held and (key, True) in _held:
-            return _held[key, True].states_only()
+            return _held[key, True].but(frames=None)
         if (key, pixels) not in _held:
             _held.clear()  # free the old pictures before new ones are read
             names = " + ".join(dict.fromkeys(part.subset for part in parts))
@@ -224,7 +217,7 @@ class CellRun:
                 scratch=self.out,
                 tick=lambda share: self.tick(f"images of {names}, {share:.0%}", 0) if pixels else None,
             )
-        return _held[key, pixels].with_stack(stack) if pixels else _held[key, pixels]
+        return _held[key, pixels].but(stack=stack) if pixels else _held[key, pixels]
 
     # -- training
 
@@ -240,7 +233,7 @@ class CellRun:
         learner = make_pretrainer(agent, encoder, data.sizes, budget.network).to(budget.device)
         steps, label = budget.pixel_steps, f"{agent.pretrain} encoder of {self.cell.task}"
         shift = learner.shifts and budget.shifts(steps, len(data))
-        curve = self._fit(learner, data, steps, shift, label)
+        curve = self._fit(learner, data, steps, label, shift=shift)
         with replacing(self.path(".safetensors")) as path:
             save_file({name: value.cpu().contiguous() for name, value in encoder.state_dict().items()}, str(path))
         probe = action_probe(learner, data) if hasattr(learner, "latent_action") else None
@@ -276,12 +269,12 @@ class CellRun:
         if frozen:
             data = self._encoded(policy.encoder, data, steps * budget.batch_size)
         evaluator = Evaluator(
-            self._subset,
+            self.subset,
             pixels=trained.pixels,
             stack=agent.stack,
             episodes=budget.episodes,
             max_steps=budget.episode_steps,
-            pair=goal_cells(self._subset, self.cell.policy[0].goal_pair),
+            pair=goal_cells(self.subset, self.cell.policy[0].goal_pair),
             backgrounds=budget.backgrounds,
             threads=budget.threads,
         )
@@ -291,19 +284,17 @@ class CellRun:
             def evaluate(_: Learner) -> dict[str, Any]:
                 nonlocal best
                 score = evaluator.score(trained)
-                if self._keeps_weights and score.mean > best:  # the policy whose score counts
+                if self.keeps_weights and score.mean > best:  # the policy whose score counts
                     trained.save(self.path(".safetensors"), budget.network)
                 best = max(best, score.mean)
                 if score.pictures is not None:
                     _save_sheet(self.path(".rollout.png"), [score.pictures])
                 return {"score": score.facts()}
 
-            return self._fit(policy, data, steps, shift, f"{agent.name} on {self.cell.place}", evaluate=evaluate)
+            label = f"{agent.name} on {self.cell.place}"
+            return self._fit(policy, data, steps, label, shift=shift, evaluate=evaluate)
 
-    def _fit(
-        self, learner: Learner, data: TrainingData, steps: int, shift: bool, label: str, evaluate: Any = None
-    ) -> Curve:
-        options = dict(shift=shift, evaluate=evaluate)
+    def _fit(self, learner: Learner, data: TrainingData, steps: int, label: str, **options: Any) -> Curve:
         return train(learner, data, self.budget, steps, tick=lambda made: self.tick(label, made), **options)
 
     def _encoded(self, encoder: nn.Module, data: TrainingData, draws: int) -> TrainingData:
@@ -319,7 +310,7 @@ class CellRun:
 
     def _facts(self, data: TrainingData, curve: Curve) -> dict[str, Any]:
         """The facts of a result, without encoder, inspection and time."""
-        cell, budget, subset = self.cell, self.budget, self._subset
+        cell, budget, subset = self.cell, self.budget, self.subset
         evaluations = [point for point in curve if "score" in point]
         best = max(evaluations, key=lambda point: point["score"]["mean"])
         normal = None
@@ -358,7 +349,7 @@ class CellRun:
         data, found = self._encoded(encoder, data, draws), dict[str, Any]()
         for name, learner in readouts.items():
             learner.to(budget.device)
-            self._fit(learner, data, steps, budget.frozen_shift, f"{name} decoder")
+            self._fit(learner, data, steps, f"{name} decoder", shift=budget.frozen_shift)
             self.tick("test errors of the decoders", 0)
             found[f"{name}_mse"] = test_error(learner, data, budget.batch_size)
         batch = draw(readouts["observation"], data, 8, budget.seed, 0, hold_out=len(data.hold_out_rows) > 0)

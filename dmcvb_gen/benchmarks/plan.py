@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from dmcvb_gen import spec
 from dmcvb_gen.agents.catalog import Agent, parse_agent
 from dmcvb_gen.agents.data import HOLD_OUT, Slice
 from dmcvb_gen.agents.learners import PARTS
@@ -25,18 +26,6 @@ from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task, read_table
 from dmcvb_gen.registry import Registry
-from dmcvb_gen.spec import (
-    ANT_MAZE,
-    DISTRACTOR_KINDS,
-    FIXED,
-    HIDDEN,
-    LEVELS,
-    MAZE_TRAINED_LEVELS,
-    VISIBLE,
-    is_maze,
-    subset_name,
-    task_folder,
-)
 from dmcvb_gen.tasks import get_task
 
 SHORT = dict(
@@ -125,7 +114,7 @@ class Cell:
     @property
     def id(self) -> str:
         """A file name, different for every cell of a release, whose subsets' names leave out a maze's rows, too."""
-        parts = [self.benchmark, task_folder(self.task), self.setting, self.agent.name, self.policy_label]
+        parts = [self.benchmark, spec.task_folder(self.task), self.setting, self.agent.name, self.policy_label]
         parts += ["from " + "+".join(part.label for part in self.pretrain)] if self.pretrain else []
         return "_".join(slug(part) for part in parts)
 
@@ -145,7 +134,7 @@ class Cell:
     @property
     def place(self) -> str:
         """Task, what the policy learns from and setting, as the report names them."""
-        return f"{task_folder(self.task)}/{self.policy_label}/{self.setting}"
+        return f"{spec.task_folder(self.task)}/{self.policy_label}/{self.setting}"
 
     @property
     def label(self) -> str:
@@ -216,12 +205,12 @@ class SubsetFinder:
     def settings(self, task: str) -> list[str]:
         """Settings of a task: those there are, in the paper's order, other difficulties last."""
         have = dict.fromkeys(setting for t, _, setting in self._names if t == task)
-        order = {setting: index for index, setting in enumerate(DISTRACTOR_KINDS)}
+        order = {setting: index for index, setting in enumerate(spec.DISTRACTOR_KINDS)}
         return sorted(have, key=lambda s: (order.get(s, len(order)), s))
 
     def levels(self, task: str, setting: str) -> list[str]:
         """Levels that there are of a task and setting, best first."""
-        return [level for level in LEVELS if (task, level, setting) in self._names]
+        return [level for level in spec.LEVELS if (task, level, setting) in self._names]
 
     def parts(self, task: str, levels: Iterable[str], setting: str) -> tuple[Slice, ...] | None:
         """All of these subsets, or None if one is missing (which is then noted)."""
@@ -234,7 +223,7 @@ class SubsetFinder:
     def missing(self, benchmark: str) -> list[Missing]:
         """Requests that nothing in the release fits, by task."""
         return [
-            Missing(benchmark, task, tuple(dict.fromkeys(subset_name(task, *place) for place in asked)))
+            Missing(benchmark, task, tuple(dict.fromkeys(spec.subset_name(task, *place) for place in asked)))
             for task, asked in self._asked.items()
         ]
 
@@ -387,11 +376,14 @@ class PolicyLearning(Benchmark):
 
     def cells(self, data, agents):
         for task in data.tasks:
-            if is_maze(task):
-                others = [level for level in data.levels(task, VISIBLE) if level not in MAZE_TRAINED_LEVELS]
-                settings, sets = [VISIBLE], [(level,) for level in (*MAZE_TRAINED_LEVELS, *others)]
+            if spec.is_maze(task):
+                others = [level for level in data.levels(task, spec.VISIBLE) if level not in spec.MAZE_TRAINED_LEVELS]
+                settings, sets = [spec.VISIBLE], [(level,) for level in (*spec.MAZE_TRAINED_LEVELS, *others)]
             else:
-                settings, sets = list(dict.fromkeys([*DISTRACTOR_KINDS, *data.settings(task)])), list(self.level_sets)
+                settings, sets = (
+                    list(dict.fromkeys([*spec.DISTRACTOR_KINDS, *data.settings(task)])),
+                    list(self.level_sets),
+                )
             for levels in sets:
                 found = {setting: data.parts(task, levels, setting) for setting in settings}
                 there = [(setting, parts) for setting, parts in found.items() if parts]
@@ -421,7 +413,7 @@ class FewEpisodes(Benchmark):
 
     def cells(self, data, agents):
         bc = parse_agent("bc")
-        for task in [task for task in data.tasks if not is_maze(task)]:
+        for task in [task for task in data.tasks if not spec.is_maze(task)]:
             full = data.parts(task, ["expert"], "none")
             if full:
                 yield Cell(self.name, task, "none", bc, full)  # scores are shares of this one
@@ -447,15 +439,15 @@ class FixedGoals(Benchmark):
     compares_encoders = True
 
     def cells(self, data, agents):
-        mazes = [task for task in data.tasks if is_maze(task)]
-        for task in mazes or [f"{ANT_MAZE}-empty7x7"]:
-            for level in data.levels(task, FIXED) or ["expert"]:
-                fixed, hidden = (data.parts(task, [level], setting) for setting in (FIXED, HIDDEN))
+        mazes = [task for task in data.tasks if spec.is_maze(task)]
+        for task in mazes or [f"{spec.ANT_MAZE}-empty7x7"]:
+            for level in data.levels(task, spec.FIXED) or ["expert"]:
+                fixed, hidden = (data.parts(task, [level], setting) for setting in (spec.FIXED, spec.HIDDEN))
                 for pair in goal_pairs(data.release[fixed[0].subset]) if fixed else ():
                     ten = (replace(fixed[0], goal_pair=pair),)
-                    yield Cell(self.name, task, FIXED, parse_agent("bc"), ten)
+                    yield Cell(self.name, task, spec.FIXED, parse_agent("bc"), ten)
                     for agent in agents if hidden else ():
-                        yield Cell(self.name, task, FIXED, agent, ten, hidden)
+                        yield Cell(self.name, task, spec.FIXED, agent, ten, hidden)
 
     def reference(self, cell):
         return "BC on these episodes"
@@ -464,7 +456,7 @@ class FixedGoals(Benchmark):
         return other.agent.name == "bc" and other.policy == cell.policy
 
     def group(self, cell):
-        return task_folder(cell.task), cell.policy_label.partition(" goal ")[0]
+        return spec.task_folder(cell.task), cell.policy_label.partition(" goal ")[0]
 
 
 @register_benchmark("b4")
@@ -482,7 +474,9 @@ class LabelBudgets(Benchmark):
 
     def cells(self, data, agents):
         bc = parse_agent("bc")
-        places = ((task, s) for task in data.tasks for s in ([VISIBLE] if is_maze(task) else data.settings(task)))
+        places = (
+            (task, s) for task in data.tasks for s in ([spec.VISIBLE] if spec.is_maze(task) else data.settings(task))
+        )
         for task, setting in places:
             whole = data.parts(task, ["expert"], setting)
             if not whole:

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from annotated_types import Ge, Gt, Lt
 
@@ -17,7 +17,6 @@ from dmcvb_gen.spec import matches
 from dmcvb_gen.text import as_names
 
 if TYPE_CHECKING:
-    from dmcvb_gen.agents.trainer import Budget
     from dmcvb_gen.benchmarks.report import Validation
 
 TRAINING = (
@@ -80,20 +79,39 @@ def validate(
         CUDA device, or the report's folder cannot be written or holds results of another release or budget.
     """
     asked = {name: value for name, value in locals().items() if name in TRAINING}
+    import torch
+
     from dmcvb_gen.benchmarks.cell import kept_results, open_data, planned_steps, run_cells
     from dmcvb_gen.benchmarks.checks import check_structure, seen_warnings
+    from dmcvb_gen.benchmarks.plan import BUDGETS
     from dmcvb_gen.benchmarks.report import Validation, claim_folder, plan_validation, report_facts, write_report
-    from dmcvb_gen.parallel.cores import default_workers
+    from dmcvb_gen.parallel.cores import default_workers, usable_cores
+    from dmcvb_gen.precision import choose_precision
     from dmcvb_gen.storage.places import local_path
 
     started = time.perf_counter()
     if checks_only:
-        _refuse_training(**asked)
+        usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
+        changed = {name: value != usual[name] for name, value in asked.items()}
+        refuse("--checks-only trains nothing", benchmark=changed.pop("benchmarks"), **changed)
     names = agent_names(agents, dino_weights)
     # Two cells of one thread each are faster than one of two; an accelerator is not shared.
     workers = workers or default_workers(2 if device == "cpu" else 1)
-    fields = dict(compile=compile, seed=seed, dino_weights=dino_weights, backgrounds=backgrounds)
-    budget = _budget(profile, scale, workers, threads, device, precision, memory, **fields)
+    if profile not in BUDGETS:
+        raise UnknownNameError("profile", profile, BUDGETS)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
+    budget = dataclasses.replace(
+        BUDGETS[profile].scaled(scale),
+        device=device,
+        precision=choose_precision(precision, device),
+        threads=threads or (max(1, usable_cores() // workers) if isinstance(workers, int) else 1),
+        memory=None if memory is None else int(memory * 1e9),
+        compile=compile,
+        seed=seed,
+        dino_weights=dino_weights and str(dino_weights),
+        backgrounds=backgrounds and str(backgrounds),
+    )
     data, patterns = open_data(release, budget), as_names(only)
     chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
     if patterns:  # a subset that was not asked for is not missing
@@ -121,13 +139,6 @@ def validate(
     return Validation(structure, tuple(results), warnings, facts["complete"], page)
 
 
-def _refuse_training(**given: Any) -> None:
-    """Refuse options of the training, which is left out."""
-    usual = {name: parameter.default for name, parameter in inspect.signature(validate).parameters.items()}
-    changed = {name: value != usual[name] for name, value in given.items()}
-    refuse("--checks-only trains nothing", benchmark=changed.pop("benchmarks"), **changed)
-
-
 def agent_names(agents: Names | None, dino_weights: Location | None) -> list[str]:
     """The names of the agents that are asked for, one a text or several with commas.
 
@@ -144,34 +155,3 @@ def agent_names(agents: Names | None, dino_weights: Location | None) -> list[str
     if dino_weights is None and needed:
         raise DmcvbError(DinoEncoder.missing)
     return names
-
-
-def _budget(profile, scale, workers, threads, device, precision, memory, **fields) -> "Budget":
-    """The budget of a validation.
-
-    Args:
-      workers: number of workers that share the cores; each gets as many threads as are left, on a cluster one.
-      memory: gigabytes of pictures held at most, over all workers; None: half of what is free.
-      fields: others of `Budget`.
-
-    Raises:
-      DmcvbError: an unknown profile, or a device that is not here.
-    """
-    import torch
-
-    from dmcvb_gen.benchmarks.plan import BUDGETS
-    from dmcvb_gen.parallel.cores import usable_cores
-    from dmcvb_gen.precision import choose_precision
-
-    if profile not in BUDGETS:
-        raise UnknownNameError("profile", profile, BUDGETS)
-    if device == "cuda" and not torch.cuda.is_available():
-        raise DmcvbError("this torch finds no CUDA device; install a CUDA build of torch or use --device cpu")
-    return dataclasses.replace(
-        BUDGETS[profile].scaled(scale),
-        device=device,
-        precision=choose_precision(precision, device),
-        threads=threads or (max(1, usable_cores() // workers) if isinstance(workers, int) else 1),
-        memory=None if memory is None else int(memory * 1e9),
-        **{name: str(value) if isinstance(value, Path) else value for name, value in fields.items()},
-    )

@@ -44,7 +44,7 @@ class DistractorSampler:
         split: str = "train",
     ):
         self.task, self.setting, self.frames = task, setting, frames
-        self._scene = Scene(task, setting, len(generators["style"]), frames, backgrounds, split)
+        self._scene = Scene(task, setting, frames, backgrounds, split)
         kinds = distractors_of(setting)
         self.own = " and ".join(f"{kind.__module__}:{kind.__name__}" for kind in kinds if kind not in BUILT_IN)
         with self._told():
@@ -61,25 +61,22 @@ class DistractorSampler:
           physics: (episode, frame, physics) float64, or (episode, physics) at that frame.
           actions: (..., action), those before each frame; zeros before the first one, or if None.
         """
+        frames = slice(physics.shape[1]) if frame is None else frame
+        if actions is None:
+            actions = np.zeros((*physics.shape[:-1], self.task.action_size))
+        found: dict[str, Any] = {}
         with self._told():
-            found = self._found(physics, actions, slice(physics.shape[1]) if frame is None else frame)
+            for nominal in self._left_out:
+                found.update(nominal.nominal(self._scene, physics))
+            for distractor in self._drawn:
+                found.update(distractor.labels(physics, frames))
+            for distractor in self._drawn:
+                distractor.adjust(found, actions, frames)
             if self.own:
                 self._check(found, physics.shape[:-1])
         return DistractorState(
             **{name: found[name].astype(LABEL_DTYPES[name]) for name in LABEL_DTYPES if name in found}
         )
-
-    def _found(self, physics: np.ndarray, actions: np.ndarray | None, frames: int | slice) -> dict[str, Any]:
-        found: dict[str, np.ndarray] = {}
-        for nominal in self._left_out:
-            found.update(nominal.nominal(self._scene, physics))
-        for distractor in self._drawn:
-            found.update(distractor.labels(physics, frames))
-        if actions is None:
-            actions = np.zeros((*physics.shape[:-1], self.task.action_size))
-        for distractor in self._drawn:
-            distractor.adjust(found, actions, frames)
-        return found
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:

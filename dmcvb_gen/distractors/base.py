@@ -22,14 +22,13 @@ class Scene:
     Attributes:
       task: the task that is shown.
       setting: kind and difficulty; ranges are multiples of its `scale`.
-      episodes, frames: number of episodes, and of frames an episode at most.
+      frames: frames an episode at most.
       backgrounds: the videos; None if the setting is "none".
       split: "train" or "val", which maze styles.
     """
 
     task: Task
     setting: DistractorSetting
-    episodes: int
     frames: int
     backgrounds: Backgrounds | None
     split: str = "train"

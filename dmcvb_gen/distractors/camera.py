@@ -52,15 +52,6 @@ def cartesian(coordinates: np.ndarray) -> np.ndarray:
     return np.stack([flat * cos_azimuth, flat * sin_azimuth, coordinates[0] * cos_polar])
 
 
-def is_overhead(offset: np.ndarray) -> bool:
-    """Return True if a nominal camera is so near the vertical that its azimuth says nothing, as reacher's is.
-
-    Args:
-      offset: (3,) nominal camera minus centre of mass, meters.
-    """
-    return bool(abs(offset[2]) > OVERHEAD * arithmetic.norm(offset))
-
-
 def turned(axes: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Sum of the columns of `axes`, (3, 3), weighed by each of the vectors (..., 3)."""
     return arithmetic.total(axes.T.reshape(3, *(1,) * (vectors.ndim - 1), 3) * np.moveaxis(vectors, -1, 0)[..., None])
@@ -152,21 +143,6 @@ def _within(position: np.ndarray, bounds: CameraRange) -> np.ndarray:
     return cartesian(np.clip(np.stack([radius, polar, azimuth]), bounds.low[:, None], bounds.high[:, None]))
 
 
-def nominal_target(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """The point that a nominal camera looks at, as far along its line of sight as the agent is away.
-
-    The Distracting Control Suite looks there, which is a little off the agent's centre of mass.
-
-    Args:
-      offset: (3,) from the centre of mass to the nominal camera, meters.
-      rotation: (3, 3) that camera's axes in the world frame; tracking cameras do not turn.
-
-    Returns:
-      (3,) from the centre of mass, meters.
-    """
-    return np.asarray(offset) - arithmetic.norm(offset) * np.asarray(rotation)[:, 2]
-
-
 def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
     """Camera matrices that look at a point, then roll about the line of sight.
 
@@ -196,20 +172,21 @@ class Camera(Distractor):
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
         self._task, model, camera = scene.task, scene.task.model, camera_ids(scene.task)[0]
         offset, rotation = np.asarray(model.cam_poscom0[camera]), model.cam_mat0[camera].reshape(3, 3)
-        overhead = is_overhead(offset)
+        overhead = bool(abs(offset[2]) > OVERHEAD * arithmetic.norm(offset))
         if overhead:  # walk as if the nominal image stood upright: right is x, into the image y, up z
             axes = np.stack([rotation[:, 0], -rotation[:, 2], rotation[:, 1]], axis=1)
             offset, rotation = turned(axes.T, offset), turned(axes.T, rotation.T).T
         bounds = camera_range(offset, scene.setting, overhead)
         walk, roll = camera_walk(bounds, scene.setting, scene.frames, generators, scene.task.action_repeat)
-        matrices = look_at(walk - nominal_target(offset, rotation), roll)
+        # Nominal cameras look a little off the agent's centre of mass, and so does the walking one.
+        target = offset - arithmetic.norm(offset) * rotation[:, 2]
+        matrices = look_at(walk - target, roll)
         if overhead:
             walk, matrices = turned(axes, walk), turned(axes, matrices.swapaxes(-1, -2)).swapaxes(-1, -2)
         self._offset, self._quaternion = walk, quaternions(matrices)
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
-        lead, flat = physics.shape[:-1], physics.reshape(-1, physics.shape[-1])
-        agent = centers_of_mass(self._task, flat).reshape(*lead, 3)
+        agent = centers_of_mass(self._task, physics)
         return {
             "camera_position": (agent + self._offset[:, frames])[..., None, :],
             "camera_quaternion": self._quaternion[:, frames][..., None, :],
@@ -217,9 +194,4 @@ class Camera(Distractor):
 
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:
-        lead, flat = physics.shape[:-1], physics.reshape(-1, physics.shape[-1])
-        position, quaternion = nominal_cameras(scene.task, flat)
-        return {
-            "camera_position": position.reshape(*lead, -1, 3),
-            "camera_quaternion": quaternion.reshape(*lead, -1, 4),
-        }
+        return dict(zip(cls.names, nominal_cameras(scene.task, physics), strict=True))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from dmcvb_gen.distractors.base import Distractor, Scene
 
 
-def _draw(rng: np.random.Generator, choices: Sequence[int]) -> int:
+def _draw(rng: np.random.Generator, choices: Sequence) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
@@ -21,8 +22,8 @@ class Style(Distractor):
     names = ("style",)
 
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
-        task, styles = scene.task, scene.task.styles(scene.split)
-        style = np.full((scene.episodes, scene.frames), -1, np.int16)
+        styles = scene.task.styles(scene.split)
+        style = np.full((len(generators), scene.frames), -1, np.int16)
         if styles:
-            style[:] = [[_draw(rng, task.looks(_draw(rng, styles)))] for rng in generators]
+            style[:] = [[_draw(rng, _draw(rng, styles))] for rng in generators]
         self.drawn = {"style": style}

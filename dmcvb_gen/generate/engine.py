@@ -37,7 +37,7 @@ from dmcvb_gen.generate.render import (
 from dmcvb_gen.generate.resolve import code_of_distractor, code_of_task
 from dmcvb_gen.generate.works import Setting, Work
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.policies.actor import Policy, random_policy
+from dmcvb_gen.policies.actor import Policy, RandomPolicy
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.storage.store import Store
@@ -237,7 +237,7 @@ def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) 
                 f"{path} is not the policy that the release names (digest {policy.digest[:12]}, asked for "
                 f"{digest[:12]}); bring back the file as it was, or give another --out"
             )
-    return loaded or [random_policy(task)]
+    return loaded or [RandomPolicy(task)]
 
 
 def _drawn_labels(work: Work, record: SubsetRecord, episodes: Episodes, backgrounds: str) -> DistractorState:

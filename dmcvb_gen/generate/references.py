@@ -47,13 +47,13 @@ def _own(release: Release, record: SubsetRecord, level: str) -> float | None:
 
 
 def _simulated(record: SubsetRecord) -> float:
-    from dmcvb_gen.policies.actor import random_policy
+    from dmcvb_gen.policies.actor import RandomPolicy
     from dmcvb_gen.policies.simulate import simulate
     from dmcvb_gen.tasks import get_task
 
     task, names = get_task(record.task).at(record.action_repeat), (*NAMES, record.task)
     episodes = list(range(RANDOM_EPISODES))
-    found = simulate(task, [random_policy(task)], episodes, SEED, names, max_steps=record.max_steps)
+    found = simulate(task, [RandomPolicy(task)], episodes, SEED, names, max_steps=record.max_steps)
     return float(found.reward.astype("float64").sum(axis=1).mean())
 
 

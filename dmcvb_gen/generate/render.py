@@ -18,7 +18,7 @@ from dmcvb_gen.distractors import Backgrounds, floor_alpha_for, load_backgrounds
 from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.generate.modalities import Modality, Seen, get_modality
 from dmcvb_gen.parallel import ProgressCallback, ignore
-from dmcvb_gen.rendering import make_renderer, renderer_class
+from dmcvb_gen.rendering import renderer_class
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import DistractorSetting
@@ -50,8 +50,8 @@ def open_renderer(
       backgrounds: "builtin" or a folder of videos.
     """
     videos = videos_of(setting, backgrounds, split)
-    look: dict[str, Any] = {"floor_alpha": floor_alpha_for(task, setting), "samples": samples}
-    return make_renderer(name, task, size, backgrounds=videos, **look), videos
+    floor = floor_alpha_for(task, setting)
+    return renderer_class(name)(task, size, backgrounds=videos, floor_alpha=floor, samples=samples), videos
 
 
 def renderer_for(record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]:

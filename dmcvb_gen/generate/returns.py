@@ -104,12 +104,12 @@ def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -
 
 
 def _policies(task: Any, level: str, behaviour: str | None, sample: bool) -> list[Any]:
-    from dmcvb_gen.policies.actor import random_policy
+    from dmcvb_gen.policies.actor import RandomPolicy
     from dmcvb_gen.policies.bundled import check_level, resolve_policies
     from dmcvb_gen.policies.policy_file import load_policy
 
     if level == "random":
-        return [random_policy(task)]
+        return [RandomPolicy(task)]
     paths = resolve_policies(task.id, level, behaviour)
     policies = [load_policy(path, task, sample) for path in paths]
     for path, policy in zip(paths, policies, strict=True):

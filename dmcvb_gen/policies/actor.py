@@ -49,14 +49,10 @@ def _affine(x, weight, bias, out):
                 out[row, j] += a0 * weight[i, j]
 
 
-def _elu(x: np.ndarray) -> np.ndarray:
-    return np.where(x > 0, x, arithmetic.exp(np.minimum(x, 0)) - 1).astype(np.float32)
-
-
 _ACTIVATIONS = {
     "relu": lambda x: np.maximum(x, np.float32(0), out=x),
     "tanh": lambda x: arithmetic.tanh(x).astype(np.float32),
-    "elu": _elu,
+    "elu": lambda x: np.where(x > 0, x, arithmetic.exp(np.minimum(x, 0)) - 1).astype(np.float32),
     "gelu": lambda x: (0.5 * x * (1 + arithmetic.erf(x * np.sqrt(0.5)))).astype(np.float32),
 }
 
@@ -116,16 +112,13 @@ class Policy:
 
     def distribution(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n, observation) -> mean and standard deviation before squashing, each (n, action) float64."""
-        features = self._features(observation)
+        header, features = self.header, self._features(observation)
         mean = self._dense("mean", features).astype(np.float64)
-        return mean, self._std(features, mean)
-
-    def _std(self, features: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        if self.header.distribution == "squashed_gaussian":
-            return arithmetic.exp(np.clip(self._dense("log_std", features), *LOG_STD_RANGE))
-        if self.header.distribution == "gaussian":
-            return np.broadcast_to(arithmetic.exp(self.weights["log_std_vector"]), mean.shape)
-        return np.full(mean.shape, self.header.noise)
+        if header.distribution == "squashed_gaussian":
+            return mean, arithmetic.exp(np.clip(self._dense("log_std", features), *LOG_STD_RANGE))
+        if header.distribution == "gaussian":
+            return mean, np.broadcast_to(arithmetic.exp(self.weights["log_std_vector"]), mean.shape)
+        return mean, np.full(mean.shape, header.noise)
 
     def act(
         self,
@@ -143,11 +136,8 @@ class Policy:
         Returns:
           (n, action) float32 in [-1, 1].
         """
-        features = self._features(observation)
-        mean = self._dense("mean", features).astype(np.float64)
-        noise = np.zeros_like(mean)
-        if not deterministic:
-            noise = self._std(features, mean) * _noise(generators or (), mean.shape[1])
+        mean, std = self.distribution(observation)
+        noise = 0.0 if deterministic else std * _noise(generators or (), mean.shape[1])
         if self.header.distribution == "gaussian":
             action = np.clip(mean + noise, -1, 1)
         elif self.header.distribution == "deterministic":
@@ -166,15 +156,10 @@ def _noise(generators: Sequence[np.random.Generator], size: int) -> np.ndarray:
 class RandomPolicy(Policy):
     """Actions uniform in [-1, 1] (level "random"); there is no mean action of these, they are always drawn."""
 
-    def __init__(self, action_size: int):
+    def __init__(self, task: Task):
         self.header = None  # type: ignore[assignment]  # no file, so no header
-        self.weights, self.digest, self._action_size = {}, "random", action_size
+        self.weights, self.digest, self._action_size = {}, "random", task.action_size
 
     def act(self, observation, generators=None, deterministic=False):
         draws = [rng.random(self._action_size, np.float32) for rng in generators]
         return np.stack(draws) * np.float32(2) - np.float32(1)
-
-
-def random_policy(task: Task) -> Policy:
-    """Uniform random actions for a task."""
-    return RandomPolicy(task.action_size)

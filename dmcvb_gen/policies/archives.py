@@ -21,7 +21,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import replacing, sha256_file
+from dmcvb_gen.files import sha256_file, write_bytes
 from dmcvb_gen.spec import is_maze
 
 INDEX = "policies.json"
@@ -78,15 +78,12 @@ def _unpack(name: str) -> Path:
     for folder in cache_folders():
         try:
             for file, content in files.items():
-                with replacing(folder / file) as path:
-                    path.write_bytes(content)
+                write_bytes(folder / file, content)
+            return folder / name
         except OSError as error:
             reason = error
-            continue
-        if _is_sound(folder / name, name):
-            return folder / name
     raise DmcvbError(
-        f"cannot unpack the policy {name} into {cache_folders()[0]} ({reason or 'other bytes came back'}); set "
+        f"cannot unpack the policy {name} into {cache_folders()[0]} ({reason}); set "
         "XDG_CACHE_HOME to a folder that can be written"
     )
 

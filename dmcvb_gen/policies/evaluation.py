@@ -7,7 +7,7 @@ import numpy as np
 from dmcvb_gen import arithmetic
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import Evaluation
-from dmcvb_gen.policies.simulate import Simulation, simulate
+from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.tasks.base import Task
 
 FRESH = "selection"
@@ -20,7 +20,7 @@ def evaluate(
     episodes: int = 100,
     seed: int = 1,
     streams: str = "evaluation",
-) -> tuple[Evaluation, Simulation]:
+) -> Evaluation:
     """Roll a policy out over fresh episodes (streams of their own, apart from every release's).
 
     Args:
@@ -31,20 +31,16 @@ def evaluate(
     """
     out = simulate(task, [policy], range(episodes), seed, (task.id, streams))
     returns = out.returns
-    lowest, lower, middle, upper, highest = map(float, np.quantile(returns, (0, 0.25, 0.5, 0.75, 1)))
     success, speed = goal_scores(task, out.state[:, 0], out.length, out.terminated)
-    return (
-        Evaluation(
-            mean=float(returns.mean()),
-            std=float(returns.std()),
-            episodes=episodes,
-            mode="mean",
-            seed=seed,
-            quartiles=(lowest, lower, middle, upper, highest),
-            success=success,
-            speed=speed,
-        ),
-        out,
+    return Evaluation(
+        mean=float(returns.mean()),
+        std=float(returns.std()),
+        episodes=episodes,
+        mode="mean",
+        seed=seed,
+        quartiles=tuple(np.quantile(returns, (0, 0.25, 0.5, 0.75, 1)).tolist()),
+        success=success,
+        speed=speed,
     )
 
 

@@ -9,17 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
+from dmcvb_gen.tasks.base import slices_of
 
 PLACE_SCALE = np.float32(5.0)
 """Meters that count as 1 to the network."""
 
 
-def _columns() -> dict[str, slice]:
-    ends = np.cumsum([FIELDS[name] for name in BEHAVIOUR_FIELDS])
-    return {name: slice(int(end) - FIELDS[name], int(end)) for name, end in zip(BEHAVIOUR_FIELDS, ends, strict=True)}
-
-
-_COLUMNS = _columns()
+_COLUMNS = slices_of({name: FIELDS[name] for name in BEHAVIOUR_FIELDS})
 
 
 def places(observation: np.ndarray) -> np.ndarray:

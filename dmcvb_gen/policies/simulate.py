@@ -57,40 +57,7 @@ class Simulation:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """By the store's names."""
-        names = ("state", "action", "reward", "discount", "physics", "length", "terminated", "seed", "behaviour")
-        return {name: getattr(self, name) for name in names} | {"return": self.returns, "goal_pair": self.goal_pair}
-
-
-def _actions(
-    policies: Sequence[Policy],
-    assigned: np.ndarray,
-    generators: Sequence[np.random.Generator],
-    observations: np.ndarray,
-    active: np.ndarray,
-    task: Task,
-    deterministic: bool,
-    step: int,
-    before: np.ndarray,
-) -> np.ndarray:
-    """Actions of a batch of episodes, each from its own policy; zeros once an episode is over.
-
-    A policy that was trained at a larger action repeat than the task's is asked in every second or fourth step alone.
-
-    Args:
-      step: number of the agent step. before: (size, action), the actions of the step before.
-
-    Returns:
-      (size, action) float32, in the task's own bounds.
-    """
-    actions = np.where(active[:, None], before, np.float32(0))
-    for index in np.unique(assigned).tolist():
-        rows = np.flatnonzero(active & (assigned == index))
-        held = max(1, (policies[index].acts_every or 1) // task.action_repeat)
-        if len(rows) and step % held == 0:
-            streams = [generators[int(row)] for row in rows]
-            given = policies[index].act(observations[rows], streams, deterministic)
-            actions[rows] = task.from_unit(given) if policies[index].unit else given
-    return actions
+        return {name: value for name, value in vars(self).items() if name != "episodes"} | {"return": self.returns}
 
 
 def _empty(task: Task, episodes: np.ndarray, limit: int) -> Simulation:
@@ -220,8 +187,12 @@ def _step_to_the_end(
         if step == limit or not active.any():
             break
         seen = batch.behaviour_observation()
-        given = (seen, active, batch.task, deterministic, step, actions)
-        actions = _actions(policies, out.behaviour, noise, *given)
+        for index, policy in enumerate(policies):
+            rows = np.flatnonzero(active & (out.behaviour == index))
+            held = max(1, (policy.acts_every or 1) // batch.task.action_repeat)
+            if len(rows) and step % held == 0:  # else a policy of a larger action repeat keeps its last actions
+                given = policy.act(seen[rows], [noise[row] for row in rows.tolist()], deterministic)
+                actions[rows] = batch.task.from_unit(given) if policy.unit else given
         result = batch.step(actions, active)
         state, over = result.state, result.terminated | result.truncated
         out.action[active, step] = actions[active]

@@ -33,6 +33,23 @@ class Renderer(abc.ABC):
     samples: int
     floor_alpha: float
 
+    def __init__(
+        self, task: Task, size: int, *, backgrounds=None, floor_alpha: float = 1.0, samples: int | None = None
+    ):
+        """Start it.
+
+        Args:
+          size: pixels a side.
+          backgrounds: the videos that labels may name (`load_backgrounds`).
+          floor_alpha: opacity of the ground plane (`distractors.floor_alpha_for`).
+          samples: samples a pixel; None: the default.
+
+        Raises:
+          RenderingError: it cannot start here.
+        """
+        check_size(size)
+        self.task, self.size, self.floor_alpha, self.backgrounds = task, size, float(floor_alpha), backgrounds
+
     @classmethod
     def unavailable(cls) -> str | None:
         """Why this renderer cannot start on this machine and what to do, or None."""

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import Renderer, check_frames, check_size, empty_labels, moved_lamps
+from dmcvb_gen.rendering.base import Renderer, check_frames, empty_labels, moved_lamps
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
 
@@ -83,9 +83,7 @@ class OpenglRenderer(Renderer):
     unavailable = staticmethod(unavailable)
 
     def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
-        check_size(size)
-        self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
-        self._backgrounds = backgrounds
+        super().__init__(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha)
         self._model = copy.deepcopy(task.picture_model)  # materials and textures change frame by frame
         self._model.vis.global_.offwidth = self._model.vis.global_.offheight = size
         self._model.vis.quality.offsamples = self.samples = 4 if samples is None else samples
@@ -176,9 +174,7 @@ class OpenglRenderer(Renderer):
             self._model.tex_data[self._sky_range] = pixels
         else:
             width = int(self._model.tex_width[self._sky])
-            if self._backgrounds is None:
-                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
-            image = Image.fromarray(self._backgrounds.frames(video)[frame])
+            image = Image.fromarray(self.backgrounds.frames(video)[frame])
             picture = np.asarray(image.resize((width, width), Image.Resampling.BILINEAR))
             self._model.tex_height[self._sky] = width
             start = self._sky_range.start

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import abc
 import copy
+import itertools
 import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence
@@ -145,12 +146,11 @@ class Task(abc.ABC):
         """Model for renderers: `model` with its textures, if `model` itself has none."""
         return self.model
 
-    def styles(self, split: str) -> tuple[int, ...]:
-        """The visual styles of data ("train") or of evaluation ("val"); none if a task has no styles."""
-        return ()
+    def styles(self, split: str) -> tuple[tuple[int, ...], ...]:
+        """The looks (labels `style`) of each visual style of data ("train") or evaluation ("val"); none without styles.
 
-    def looks(self, style: int) -> tuple[int, ...]:
-        """The visual looks of a style (labels `style`), all as likely; none if a task has no styles."""
+        All looks of a style are as likely.
+        """
         return ()
 
     def style_geom_matid(self, look: int) -> np.ndarray | None:
@@ -193,11 +193,7 @@ class Task(abc.ABC):
     @property
     def state_slices(self) -> dict[str, slice]:
         """Slice of each field in the state."""
-        ends = np.cumsum(list(self.state_fields.values()))
-        return {
-            name: slice(int(end - size), int(end))
-            for (name, size), end in zip(self.state_fields.items(), ends, strict=True)
-        }
+        return slices_of(self.state_fields)
 
     @property
     def behaviour_size(self) -> int:
@@ -248,6 +244,12 @@ class Task(abc.ABC):
     @abc.abstractmethod
     def batch(self, size: int, threads: int = 1) -> EpisodeBatch:
         """`size` episodes side by side, stepped on `threads` threads (the result does not depend on them)."""
+
+
+def slices_of(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Slice of each field, name -> size, of fields one after another."""
+    ends = itertools.accumulate(sizes.values())
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 def field_owner(model: mujoco.MjModel, name: str) -> tuple[Any, str]:
@@ -327,17 +329,6 @@ class EpisodeBatch(abc.ABC):
         """
         raise DmcvbError(f"{self.task.id} has no cells to start at; give an ant-maze task")
 
-    def _check_actions(self, actions: np.ndarray) -> np.ndarray:
-        """The actions as float64.
-
-        Raises:
-          ValueError: they have another shape.
-        """
-        actions, expected = np.asarray(actions, np.float64), (self.size, self.task.action_size)
-        if actions.shape != expected:
-            raise ValueError(f"actions have shape {actions.shape}, expected {expected}")
-        return actions
-
 
 class PhysicsBatch(EpisodeBatch):
     """Episodes of one of DMC-VB's own tasks, written for a whole batch.
@@ -349,7 +340,9 @@ class PhysicsBatch(EpisodeBatch):
     def __init__(self, task: Task, size: int, threads: int = 1):
         super().__init__(task, size)
         self.sims = Batch(task.model, size, nthread=threads, persistent=True)
-        self._ctrl = self.sims.bind("ctrl")
+        bind = self.sims.bind
+        self._qpos, self._qvel, self._ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        self._xmat, self._xpos, self._sensors = bind("xmat"), bind("xpos"), bind("sensordata")
         self._steps = np.zeros(size, int)
         self._physics_columns = physics_columns(task.model)
 
@@ -380,9 +373,8 @@ class PhysicsBatch(EpisodeBatch):
         self._steps[ids] = 0
 
     def step(self, actions, active=None):
-        actions = self._check_actions(actions)
         moving = np.ones(self.size, bool) if active is None else np.array(active, bool)
-        self._ctrl[moving] = actions[moving]
+        self._ctrl[moving] = np.asarray(actions, np.float64)[moving]
         reward = np.zeros(self.size)
         terminated = np.zeros(self.size, bool)
         stepped = np.flatnonzero(moving)

@@ -20,8 +20,15 @@ KEPT = 2
 """Tasks whose simulations are kept, those asked for last."""
 
 
-class _KeptBatch:
-    """A task's simulations for kinematics: made once, as many as the largest call needs (up to `CHUNK`)."""
+@functools.lru_cache(maxsize=KEPT)
+class Kinematics:
+    """Forward kinematics of a task's physics states; may be called from several threads.
+
+    A task's simulations are made once, as many as the largest call needs (up to `CHUNK`).
+
+    Args:
+      task: whose model it is.
+    """
 
     def __init__(self, task: Task):
         self._task, self._columns = task, physics_columns(task.model, task.physics_spec)
@@ -29,6 +36,11 @@ class _KeptBatch:
         self._size = 0
 
     def __call__(self, physics: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
+        """(frame, physics) float64 -> each field of MjData with a leading frame axis, float64.
+
+        A frame's poses do not depend on the other frames.
+        """
+        lead, physics = physics.shape[:-1], physics.reshape(-1, physics.shape[-1])
         with self._lock:
             if (size := min(max(len(physics), 1), CHUNK)) > self._size:
                 self._make(size)
@@ -45,7 +57,7 @@ class _KeptBatch:
                 self._batch.forward(ids=ids, stage=int(mujoco.mjtStage.mjSTAGE_POS))
                 for name in fields:
                     out[name][first : first + count] = self._bound[name][:count]
-        return out
+        return {name: value.reshape(*lead, *value.shape[1:]) for name, value in out.items()}
 
     def _make(self, size: int) -> None:
         self._size = 1 << (size - 1).bit_length()
@@ -61,28 +73,6 @@ def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
         model = copy.deepcopy(model)
         model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     return model
-
-
-_kept = functools.lru_cache(maxsize=KEPT)(_KeptBatch)
-
-
-class Kinematics:
-    """Forward kinematics of a task's physics states; cheap to make, may be called from several threads.
-
-    Args:
-      task: whose model it is. All `Kinematics` of a task share one batch of simulations while it is kept (`KEPT`).
-      fields: MjData fields to give, e.g. ("geom_xpos", "cam_xmat").
-    """
-
-    def __init__(self, task: Task, fields: Sequence[str]):
-        self._fields, self._batch = tuple(fields), _kept(task)
-
-    def __call__(self, physics: np.ndarray) -> dict[str, np.ndarray]:
-        """(frame, physics) float64 -> each field with a leading frame axis, float64.
-
-        A frame's poses do not depend on the other frames.
-        """
-        return self._batch(np.asarray(physics, np.float64), self._fields)
 
 
 def camera_ids(task: Task) -> list[int]:
@@ -123,9 +113,9 @@ def nominal_cameras(task: Task, physics: np.ndarray) -> tuple[np.ndarray, np.nda
       position (frame, view, 3) and quaternion (frame, view, 4), float32.
     """
     ids = camera_ids(task)
-    found = Kinematics(task, ("cam_xpos", "cam_xmat"))(physics)
-    position = found["cam_xpos"][:, ids]
-    rotation = found["cam_xmat"][:, ids].reshape(len(physics), len(ids), 3, 3)
+    found = Kinematics(task)(physics, ("cam_xpos", "cam_xmat"))
+    position, rotation = found["cam_xpos"][..., ids, :], found["cam_xmat"][..., ids, :]
+    rotation = rotation.reshape(*position.shape, 3)
     return position.astype(np.float32), quaternions(rotation).astype(np.float32)
 
 
@@ -137,5 +127,5 @@ def centers_of_mass(task: Task, physics: np.ndarray) -> np.ndarray:
     camera = camera_ids(task)[0]
     body = int(task.model.cam_bodyid[camera])
     if body == 0:
-        return np.tile(task.model.cam_pos0[camera] - task.model.cam_poscom0[camera], (len(physics), 1))
-    return Kinematics(task, ("subtree_com",))(physics)["subtree_com"][:, body]
+        return np.tile(task.model.cam_pos0[camera] - task.model.cam_poscom0[camera], (*physics.shape[:-1], 1))
+    return Kinematics(task)(physics, ["subtree_com"])["subtree_com"][..., body, :]

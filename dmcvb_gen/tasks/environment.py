@@ -11,7 +11,6 @@ import copy
 import functools
 import hashlib
 import math
-import weakref
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -60,7 +59,7 @@ class EnvironmentTask(Task):
 
     Args:
       id: the task's name.
-      make: makes an environment; called again for every episode, if it is not the suite's.
+      make: makes an environment; called again for every episode.
       domain: dm_control's domain, for its own suite; decides the floor's opacity under distractors.
 
     Raises:
@@ -75,7 +74,7 @@ class EnvironmentTask(Task):
     most_at_once = 8  # an environment holds a model and its data: 12 MB for most of the suite, 80 for the dog
 
     def __init__(self, id: str, make: Callable[[], Any], domain: str = ""):
-        self.id, self._make, self._idle = id, make, list[Any]()
+        self.id, self._make = id, make
         self._terrain = functools.lru_cache(maxsize=64)(self._draw_terrain)  # images come in the order of their videos
         self.floor_alpha = {"walker": 1.0, "cheetah": 1.0, "reacher": 0.0}.get(domain, 0.3)
         self.trusted = bool(domain)  # the tests compare the suite's tasks with dm_control
@@ -130,9 +129,8 @@ class EnvironmentTask(Task):
             model.hfield_data[:] = self._terrain(key)
 
     def _draw_terrain(self, key: tuple[int, ...]) -> np.ndarray:
-        episode = _Episode(self, self.take_environment(seed := key[0] << 32 | key[1]))
+        episode = _Episode(self, self.make_environment(seed := key[0] << 32 | key[1]))
         episode.reset(seed)
-        self.give_back([episode.environment])
         if episode.terrain != key:
             raise self.error("draws other terrain than is stored; install dm_control, numpy and scipy as they were")
         return episode.model.hfield_data.copy()
@@ -154,17 +152,8 @@ class EnvironmentTask(Task):
         with seeded(seed):
             return self._make()
 
-    def take_environment(self, seed: int) -> Any:
-        """An environment for an episode: a new one, or an idle one of the suite."""
-        return self._idle.pop() if self._idle else self.make_environment(seed)
-
     def error(self, reason: str) -> DmcvbError:
         return DmcvbError(f"task {self.id} {reason}")
-
-    def give_back(self, environments: list[Any]) -> None:
-        """Take environments whose episodes are over."""
-        if self.trusted:
-            self._idle += environments
 
     # -- the check at the start -------------------------------------------------------------------
 
@@ -179,11 +168,9 @@ class EnvironmentTask(Task):
         self.model = copy.deepcopy(environment.physics.model._model)
         if not self.model.ncam:
             raise DmcvbError(f"{self.id} has no camera to look through; add a <camera> to its model")
-        if self.trusted:
-            probes += [_Probe(self, environment, seed) for seed in (second, first)]
-        else:
-            with starting(self.id):
-                probes += [_Probe(self, self.make_environment(seed), seed) for seed in (second, second, first)]
+        with starting(self.id):
+            probes += [_Probe(self, self.make_environment(seed), seed) for seed in (second, second, first)]
+        if not self.trusted:
             self._check_probes(probes)
         start, assets = probes[0].models[0], probes[0].assets
         changed = {name for probe in probes for name in probe.changed(start)}
@@ -200,7 +187,6 @@ class EnvironmentTask(Task):
                 f"{self.id} changes {name} of the model in its episodes, which cannot be stored; leave it as it is, or "
                 "make a task for each"
             )
-        self.give_back([environment])
 
     def _check_probes(self, probes: Sequence[_Probe]) -> None:
         """Refuse a task whose episodes do not follow from their seeds."""
@@ -216,21 +202,14 @@ class EnvironmentTask(Task):
                 "keep nothing outside of the environment"
             )
 
-    def changed_field(self, model: mujoco.MjModel) -> str | None:
-        """The field of an episode's model that no short episode of the start's check changed; None if there is none."""
+    def fixed_values(self, model: mujoco.MjModel) -> list[tuple[str, Callable[[], Any], Any]]:
+        """The fields that no short episode of the start's check changed: name, what gives it now, its value there."""
+        found = list[tuple[str, Callable[[], Any], Any]]()
         for name, value in self._fixed.items():
             owner, field = field_owner(model, name)
-            if not same(np.ravel(getattr(owner, field)), value):
-                return name
-        return None
-
-    def fixed_values(self, model: mujoco.MjModel) -> list[tuple[Callable[[], Any], Any]]:
-        """What `changed_field` compares, for every step: functions that each give a field, and what they give now."""
-        found = list[tuple[Callable[[], Any], Any]]()
-        for owner, field in (field_owner(model, name) for name in self._fixed):
-            value = getattr(owner, field)  # an array is a view, which is quicker to ask than the model
-            read = value.tobytes if isinstance(value, np.ndarray) else functools.partial(getattr, owner, field)
-            found.append((read, read()))
+            now = getattr(owner, field)  # an array is a view, which is quicker to ask than the model
+            whole = (now.tobytes, value.tobytes()) if isinstance(now, np.ndarray) else None
+            found.append((name, *(whole or (functools.partial(getattr, owner, field), value[0]))))
         return found
 
 
@@ -342,7 +321,7 @@ class _Episode:
         self.task, self.environment, self.place = task, environment, place
         self.steps, self.terminated, self.truncated = 0, False, False
         self.state, self.terrain = np.zeros(0), tuple[int, ...]()
-        self._checked: tuple[Any, list[tuple[Callable[[], Any], Any]]] = None, []
+        self._checked: mujoco.MjModel | None = None
 
     @property
     def over(self) -> bool:
@@ -414,14 +393,14 @@ class _Episode:
         """Raise EpisodeError if the episode changed the model where the episodes of the start's check did not."""
         if self.task.draws_terrain and zlib.crc32(self.model.hfield_data) != self.terrain[-1]:
             raise self.error(f"it changed {TERRAIN} of the model in a step; change it at the start of an episode alone")
-        model, (checked, values) = self.model, self._checked
-        if model is checked and all(read() == value for read, value in values):
-            return
-        if name := self.task.changed_field(model):
-            raise self.error(
-                f"it changed {name} of the model, which its first episodes left as it was; change it in every episode"
-            )
-        self._checked = model, self.task.fixed_values(model)
+        if self.model is not self._checked:
+            self._checked, self._values = self.model, self.task.fixed_values(self.model)
+        for name, read, value in self._values:
+            if read() != value:
+                raise self.error(
+                    f"it changed {name} of the model, which its first episodes left as it was; change it in every "
+                    "episode"
+                )
 
     def _warnings(self) -> np.ndarray:
         return self.environment.physics.data.warning.number[BAD_STATES]
@@ -482,24 +461,14 @@ class EnvironmentBatch(EpisodeBatch):
     def __init__(self, task: EnvironmentTask, size: int):
         super().__init__(task, size)
         self._episodes: list[_Episode | None] = [None] * size
-        self._in_use: list[Any] = []
-        weakref.finalize(self, EnvironmentTask.give_back, task, self._in_use)
 
     def _start(self, ids, generators):
         for sim, generator in zip(ids.tolist(), generators, strict=True):
             self._begin(sim, int(generator.integers(2**63)))
 
     def _begin(self, sim: int, seed: int) -> _Episode:
-        """A new episode in a place; in the suite, its predecessor's environment is used again."""
-        before = self._episodes[sim]
-        if before is not None and not self.task.trusted:
-            self._in_use.remove(before.environment)
-        if before is None or not self.task.trusted:
-            environment = self.task.take_environment(seed)
-            self._in_use.append(environment)
-        else:
-            environment = before.environment
-        episode = self._episodes[sim] = _Episode(self.task, environment, sim)
+        """A new episode in a place, in an environment of its own."""
+        episode = self._episodes[sim] = _Episode(self.task, self.task.make_environment(seed), sim)
         episode.reset(seed)
         return episode
 
@@ -521,7 +490,7 @@ class EnvironmentBatch(EpisodeBatch):
         return self.state()
 
     def step(self, actions, active=None):
-        actions = self._check_actions(actions)
+        actions = np.asarray(actions, np.float64)
         reward, discount = np.zeros(self.size), np.ones(self.size)
         moving = self._all if active is None else np.flatnonzero(active)
         episodes = [episode for sim in moving.tolist() if not (episode := self._running(sim)).over]

@@ -51,10 +51,6 @@ class LocomotionBatch(PhysicsBatch):
 
     def __init__(self, task: Task, size: int, threads: int = 1):
         super().__init__(task, size, threads)
-        bind = self.sims.bind
-        self._qpos, self._qvel = bind("qpos"), bind("qvel")
-        self._xmat, self._xpos = bind("xmat"), bind("xpos")
-        self._sensors = bind("sensordata")
         self._torso = task.model.body("torso").id
         self._velocity = int(task.model.sensor("torso_subtreelinvel").adr[0])
 

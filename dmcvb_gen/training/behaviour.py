@@ -181,7 +181,8 @@ def plan_of(run: "Run", done: int = 0) -> list[str]:
         steps.append(f"{done:,} of them done")
     lines = [f"{', '.join(how)}: {', '.join(steps)}."]
     if config.steps - done >= PROBED_STEPS:
-        time_left = _minutes(probe(run) * (config.steps - done))
+        left = probe(run) * (config.steps - done)
+        time_left = f"{math.ceil(left / 60)} min" if left < 5400 else f"{left / 3600:.1f} h"
         lines.append(f"About {time_left} of one core, without evaluations (from a two-second try).")
     if bundled_names(config.task, "expert"):
         known = read_header(bundled_policies(config.task, "expert")[0])
@@ -189,10 +190,6 @@ def plan_of(run: "Run", done: int = 0) -> list[str]:
             after = f"after {known.agent_step:,} agent steps"
             lines.append(f"To expect: {known.evaluation.mean:.0f}, as the package's own expert has {after}.")
     return lines
-
-
-def _minutes(seconds: float) -> str:
-    return f"{math.ceil(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class _Enough(Exception):

@@ -221,14 +221,14 @@ def train(run: Run) -> None:
         copy_file(_base_file(run), kept)
     student, saved = Student(run, base), run.saved()
     episodes = Episodes(run.task, settings, run.config.seed, student.rng)
-    if saved:
-        student.load_state(saved["learner"])
-        episodes.restore(saved["episodes"])
 
     def state() -> dict[str, Any]:
         return {"learner": student.state(), "episodes": episodes.saved()}
 
-    if not saved:
+    if saved:
+        student.load_state(saved["learner"])
+        episodes.restore(saved["episodes"])
+    else:
         run.save(state())
     while run.step < run.config.steps:
         episodes.step(student.act(episodes.observation))

@@ -23,8 +23,7 @@ from torch.nn.functional import softplus
 
 from dmcvb_gen.compilation import compiled
 from dmcvb_gen.policies.header import PolicyHeader
-from dmcvb_gen.training.run import Run
-from dmcvb_gen.training.sac import Collector, CriticEnsemble, Learner, ReplaySettings, check_replay, in_order, network
+from dmcvb_gen.training.sac import CriticEnsemble, Learner, ReplaySettings, check, in_order, network, train
 from dmcvb_gen.training.settings import Count, Positive
 
 __all__ = ["Mpo", "Settings", "check", "network", "train"]
@@ -181,21 +180,4 @@ class Mpo(Learner):
         self.target_actor.load_state_dict(self.actor.state_dict())  # it draws what the actor is fitted to
 
 
-def check(run: Run) -> None:
-    """Refuse, before anything is written, a run that would learn nothing, or that its start does not fit."""
-    check_replay(run, Mpo)
-
-
-def train(run: Run) -> None:
-    """Train until the run's last step, or until it is stopped."""
-    learner = Mpo(run.header, run.settings, run.config.seed)
-    collector = Collector(run, learner)
-    while run.step < run.config.steps:
-        collector.step()
-        learner.sync_norm()
-        for batch in collector.batches():
-            learner.update(batch)
-        if run.evaluation_is_due():
-            run.record(learner.actor.state_dict(), learner.updates, learner.metrics())
-        run.checkpoint_if_due(collector.state, learner.actor.state_dict)
-    run.save(collector.state())
+LEARNER = Mpo

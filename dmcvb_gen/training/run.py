@@ -269,7 +269,7 @@ class Run:
         """Evaluate the actor's `weights`, write them as a checkpoint, log; evaluations are not training time."""
         self.seconds += time.time() - self._began
         policy = Policy(self.header, as_arrays(weights), "")
-        evaluation, _ = evaluate(policy, self.task, self.evaluation_episodes(), seed=self.step)
+        evaluation = evaluate(policy, self.task, self.evaluation_episodes(), seed=self.step)
         self._write_checkpoint(policy, evaluation)
         row = {"step": self.step, "seconds": round(self.seconds, 1), "updates": updates}
         row |= {"return_mean": evaluation.mean, "return_std": evaluation.std}

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -363,6 +363,11 @@ class Learner(nn.Module):
         self.actor.observation_mean.copy_(torch.from_numpy(self.norm.mean))
         self.actor.observation_std.copy_(torch.from_numpy(self.norm.std))
 
+    def take_in(self, moment: Moment, step: int) -> float:
+        """Take in a step of all simulations, before the updates; gives `Collector.batches` its share."""
+        self.sync_norm()
+        return 1.0
+
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Actions for collecting, (n, observation) -> (n, action) float32: means in the first rows, samples below."""
         with torch.no_grad():
@@ -435,6 +440,13 @@ class Sac(Learner):
         self._losses: dict[str, torch.Tensor] = {}
         self._critic_loss = compiled(self.critic_loss) if settings.compile else self.critic_loss
         self._actor_loss = compiled(self.actor_loss) if settings.compile else self.actor_loss
+
+    def take_in(self, moment: Moment, step: int) -> float:
+        super().take_in(moment, step)
+        self.returns.update(moment.reward, moment.ended)
+        self.schedule(step)
+        half_life = self.settings.n_step_half_life
+        return 1 / (1 + step / half_life) if half_life else 1.0
 
     def schedule(self, step: int) -> None:
         """Set learning rates and target entropy of an agent step."""
@@ -577,18 +589,6 @@ class Collector:
             yield self.buffer.sample_steps(self.rng, settings.batch_size, settings.n_step, settings.discount, share)
 
 
-def check_replay(run: Run, kind: Callable[..., Learner]) -> None:
-    """Refuse a run of a learner, which `kind` makes, that would learn nothing, or that its start does not fit."""
-    settings, steps = run.settings, min(run.config.steps, run.settings.buffer_size)
-    if steps <= settings.warmup_steps:
-        raise DmcvbError(
-            f"{steps} steps are all warm-up ({settings.warmup_steps} steps), nothing would be learned; give more "
-            "--steps (or buffer_size), or less warm-up: --set warmup_steps=N"
-        )
-    if run.config.init_from and not run.begun:
-        start_from(kind(run.header, settings, run.config.seed), run)
-
-
 def network(run: Run) -> dict[str, Any]:
     """The header's fields that say how the actor is built."""
     return {"hidden": tuple(run.settings.actor_hidden)}
@@ -600,23 +600,28 @@ def check(run: Run) -> None:
     Raises:
       DmcvbError: what is wrong and the cure.
     """
-    check_replay(run, Sac)
+    settings, steps = run.settings, min(run.config.steps, run.settings.buffer_size)
+    if steps <= settings.warmup_steps:
+        raise DmcvbError(
+            f"{steps} steps are all warm-up ({settings.warmup_steps} steps), nothing would be learned; give more "
+            "--steps (or buffer_size), or less warm-up: --set warmup_steps=N"
+        )
+    if run.config.init_from and not run.begun:
+        start_from(run.algorithm.LEARNER(run.header, settings, run.config.seed), run)
 
 
 def train(run: Run) -> None:
-    """Train until the run's last step, or until it is stopped."""
-    settings = run.settings
-    learner = Sac(run.header, settings, run.config.seed)
+    """Train the algorithm's learner until the run's last step, or until it is stopped."""
+    learner = run.algorithm.LEARNER(run.header, run.settings, run.config.seed)
     collector = Collector(run, learner)
     while run.step < run.config.steps:
         moment = collector.step()
-        learner.returns.update(moment.reward, moment.ended)
-        learner.sync_norm()
-        learner.schedule(run.step)
-        half_life = settings.n_step_half_life
-        for batch in collector.batches(1 / (1 + run.step / half_life) if half_life else 1.0):
+        for batch in collector.batches(learner.take_in(moment, run.step)):
             learner.update(batch)
         if run.evaluation_is_due():
             run.record(learner.actor.state_dict(), learner.updates, learner.metrics())
         run.checkpoint_if_due(collector.state, learner.actor.state_dict)
     run.save(collector.state())
+
+
+LEARNER = Sac

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import pydantic
@@ -25,9 +25,9 @@ import pydantic
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.files import write_json
 from dmcvb_gen.parallel import ProgressCallback, expect, ignore
-from dmcvb_gen.policies.actor import Policy, random_policy
+from dmcvb_gen.policies.actor import Policy, RandomPolicy
 from dmcvb_gen.policies.evaluation import FRESH, evaluate
-from dmcvb_gen.policies.header import Evaluation, PolicyHeader
+from dmcvb_gen.policies.header import Evaluation
 from dmcvb_gen.policies.paper import medium_return
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze, task_folder
@@ -35,9 +35,6 @@ from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.text import pluralize
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 EXPERT_SHARE, MEDIUM_SHARE, MIXED_COUNT = 0.95, 0.5, 8
 MEDIUM_TOLERANCE = 0.1
@@ -117,9 +114,9 @@ class Selection:
     reasons: dict[str, str] = field(default_factory=dict)
 
 
-def smooth(values: Sequence[float], window: int = SMOOTHING) -> np.ndarray:
+def smooth(values: Sequence[float]) -> np.ndarray:
     """Moving median, shorter at the ends."""
-    values, half = np.asarray(values, float), window // 2
+    values, half = np.asarray(values, float), SMOOTHING // 2
     return np.array([np.median(values[max(0, i - half) : i + half + 1]) for i in range(len(values))])
 
 
@@ -309,7 +306,7 @@ def select_checkpoints(
         expect(progress, max(len(measured) + 1, MEASURED))
         progress(f"step {int(path.stem):,}")
         policy = measured[str(path)] = load_policy(path, task)
-        return evaluate(policy, task, episodes, SEED, streams=FRESH)[0]
+        return evaluate(policy, task, episodes, SEED, streams=FRESH)
 
     end = converge([step for step, _, _ in curve], [value for _, value, _ in curve], base)
     if convergence is not None:
@@ -326,27 +323,24 @@ def _base(task: Task, episodes: int) -> float:
     """Return at 0 % of the way: that of random actions where returns may be negative, else 0."""
     if task.return_range[0] >= 0:
         return 0.0
-    return evaluate(random_policy(task), task, min(episodes, BASE_EPISODES), SEED, streams=FRESH)[0].mean
+    return evaluate(RandomPolicy(task), task, min(episodes, BASE_EPISODES), SEED, streams=FRESH).mean
 
 
 def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies: Mapping[str, Policy]) -> None:
-    """Write the picks and selection.json into a run's folder."""
+    """Write the picks and selection.json into a run's folder.
+
+    The header of a picked policy also says what it was picked for, and has the whole learning curve of its run.
+    """
+    shown = {"steps": [step for step, _, _ in curve], "returns": [round(value, 2) for _, value, _ in curve]}
     for level, picks in selection.picks.items():
         for pick in picks:
             policy = policies[pick.path]
-            header = selected_header(policy.header, level, pick, selection.convergence, curve)
+            why = {"target": pick.target, "convergence": round(selection.convergence.value, 2)}
+            facts = {"level": level, "evaluation": pick.evaluation}
+            facts["training"] = policy.header.training | {"selection": why, "curve": shown}
+            header = policy.header.model_copy(update=facts)
             save_policy(folder / "selected" / f"{pick.name}.safetensors", header, policy.weights)
     write_json(folder / "selection.json", selection_json(selection))
-
-
-def selected_header(
-    header: PolicyHeader, level: str, pick: Pick, convergence: Convergence, curve: Sequence[Point]
-) -> PolicyHeader:
-    """The header of a picked policy: also what it was picked for, and the whole learning curve of its run."""
-    why = {"selection": {"target": pick.target, "convergence": round(convergence.value, 2)}}
-    shown = {"curve": {"steps": [step for step, _, _ in curve], "returns": [round(value, 2) for _, value, _ in curve]}}
-    facts = {"level": level, "evaluation": pick.evaluation, "training": header.training | why | shown}
-    return header.model_copy(update=facts)
 
 
 def selection_json(selection: Selection) -> dict:
@@ -388,7 +382,7 @@ def plot_curve(folder: str | Path, expert: float | None = None, selection: Selec
     return path
 
 
-def _mark_picks(axes: Axes, selection: Selection, steps: Sequence[int]) -> None:
+def _mark_picks(axes: Any, selection: Selection, steps: Sequence[int]) -> None:
     end = selection.convergence.value
     axes.axhline(end, color="tab:blue", linestyle=":", linewidth=1)
     axes.text(steps[0], end, f" convergence {end:.0f}", va="bottom")

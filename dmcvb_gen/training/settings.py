@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import importlib
 import inspect
 import json
@@ -110,20 +109,16 @@ def parse_settings(pairs: Sequence[str], algorithm: str) -> dict[str, Any]:
     return {name: json.loads(json.dumps(checked[name])) for name in settings}
 
 
-@functools.cache
-def _defaults() -> dict[str, Any]:
-    return read_yaml(resources.files("dmcvb_gen.training") / "defaults.yaml")
-
-
 def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
     """{"steps", "evaluate_every", "settings"} of a task's run; settings are those that are not the algorithm's own."""
     family = ANT_MAZE if is_maze(task_id) else task_id
+    defaults = read_yaml(resources.files("dmcvb_gen.training") / "defaults.yaml")
     values: dict[str, Any] = {"settings": {}}
     for name in ("all", family, f"{family}/{algorithm}"):
-        values |= _defaults().get(name, {})
+        values |= defaults.get(name, {})
     if is_own(task_id) and algorithm == "sac":
         from dmcvb_gen.tasks import get_task
 
         steps = WARMUP_EPISODES * get_task(task_id).max_steps
         values["settings"] = {"warmup_steps": min(max(steps, SHORTEST_WARMUP), LONGEST_WARMUP)}
-    return values | {"settings": dict(values["settings"])}
+    return values

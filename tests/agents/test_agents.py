@@ -240,7 +240,7 @@ def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
     data, policies = make_data(), []
     for encoded in (False, True):
         torch.manual_seed(0)
-        encoder = observation_encoder(data.channels, data.frames.size)
+        encoder = observation_encoder(data.sizes.channels, data.frames.size)
         policy = (BehaviorCloning if frozen == "bc" else TD3BC)(encoder, data.sizes, frozen=True)
         seen = data.encoded(encoder) if encoded else data
         train(policy, seen, Budget("short", batch_size=8, seed=3), 4, shift=False)
@@ -252,9 +252,11 @@ def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
 # -- gradients ------------------------------------------------------------------------------------
 
 
-def td3(alpha=2.5):
+def td3(alpha=2.5, sizes=SIZES):
     torch.manual_seed(0)
-    return TD3BC(None, SIZES, alpha=alpha)
+    learner = TD3BC(None, sizes)
+    learner.alpha = alpha
+    return learner
 
 
 KINDS = {
@@ -262,7 +264,7 @@ KINDS = {
     "bc on states": (lambda: BehaviorCloning(state_encoder(STATES), STATE_SIZES), ("encoder", "policy"), 60, 0.05),
     "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), ("policy",), 60, 0.05),
     "td3-bc": (lambda: td3(alpha=0.01), ("net.critic1", "net.critic2"), 80, 0.1),  # critics first
-    "td3-bc on states": (lambda: TD3BC(None, STATE_SIZES, alpha=0.01), ("net.critic1", "net.critic2"), 150, 0.1),
+    "td3-bc on states": (lambda: td3(0.01, STATE_SIZES), ("net.critic1", "net.critic2"), 150, 0.1),
     "id": (lambda: InverseDynamics(small_encoder(), SIZES), ("encoder", "f."), 40, 0.05),
     "sampled id": (
         lambda: InverseDynamics(small_encoder(), SIZES, k=4, sample=True), ("encoder", "f.", "embed_k"), 40, 0.05
@@ -521,7 +523,7 @@ def test_every_agent_can_be_made_and_acts(name):
 
     agent, data = parse_agent(name), make_data()
     assert agent.name == name
-    data = data.states_only() if agent.sees_state else data
+    data = data.but(frames=None) if agent.sees_state else data
     encoder = make_encoder(agent, data.sizes)
     if agent.pretrain:
         make_pretrainer(agent, encoder, data.sizes)

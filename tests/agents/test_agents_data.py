@@ -106,7 +106,9 @@ def test_the_later_observation_is_k_steps_on_and_the_next_one_a_step():
 
 def test_labeled_transitions_are_those_of_some_episodes_and_tests_are_of_others():
     data = make_data(held=(True, True, False)).with_labels(np.array([True, False, True]))
-    drawn = data.labeled().batch(200, np.random.default_rng(0), next_observation=True, shift=False)
+    drawn = data.but(train_rows=data.labeled_rows).batch(
+        200, np.random.default_rng(0), next_observation=True, shift=False
+    )
     rows = drawn.reward.long()
     assert set(rows.tolist()) == {0, 1, 2, 3, 13, 14}
     torch.testing.assert_close(drawn.next_observation, data.observe(rows + 1))
@@ -147,7 +149,7 @@ def test_states_are_normalized_by_the_training_episodes_with_a_floor():
 def test_a_subset_is_held_as_it_is_stored(small_release):
     subset = Release.open(small_release)["walker-walk/random/dynamic"]
     data = load_data({subset.name: subset}, [Slice(subset.name)])
-    assert not data.frames.mapped and data.channels == 9
+    assert not data.frames.mapped and data.sizes.channels == 9
     assert (data.held_out.sum(), len(data), len(data.hold_out_rows)) == (1, 1000, 500)
     episode = subset.episode(2)
     last = data.observe(torch.tensor([2 * 501 + 400]))[0, -3:]
@@ -258,7 +260,7 @@ def state_learner(data):
 
 def test_the_curve_has_losses_hold_out_and_scores(monkeypatch):
     monkeypatch.setattr(trainer, "POINTS", 3)
-    data = make_data().states_only()
+    data = make_data().but(frames=None)
     curve = train(state_learner(data), data, SHORT, 12, evaluate=lambda learner: {"score": 1.0})
     assert [point["step"] for point in curve] == [4, 8, 12]
     assert all({"loss", "test_loss", "score", "seconds"} <= set(point) for point in curve)
@@ -266,7 +268,7 @@ def test_the_curve_has_losses_hold_out_and_scores(monkeypatch):
 
 
 def test_random_numbers_of_a_step_hang_on_the_seed_and_on_the_step(monkeypatch):
-    data, drawn = make_data().states_only(), []
+    data, drawn = make_data().but(frames=None), []
     for seed in (0, 0, 1):
         learner = state_learner(data)
         monkeypatch.setattr(
@@ -278,7 +280,7 @@ def test_random_numbers_of_a_step_hang_on_the_seed_and_on_the_step(monkeypatch):
 
 def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to(monkeypatch):
     monkeypatch.setattr(trainer, "TICK_SECONDS", -1.0)
-    data, rates = make_data().states_only(), {True: [], False: []}
+    data, rates = make_data().but(frames=None), {True: [], False: []}
     for decay, seen in rates.items():
         learner = state_learner(data)
         [group] = learner.optimizers["main"].param_groups
@@ -288,7 +290,7 @@ def test_the_learning_rate_falls_linearly_to_zero_where_it_is_asked_to(monkeypat
 
 
 def test_a_loss_that_is_no_longer_finite_stops_the_run():
-    data = make_data().states_only()
+    data = make_data().but(frames=None)
     data.action[data.train_rows] = float("nan")
     with pytest.raises(DmcvbError, match="no longer finite at step 1; look at the agent's losses, and at the data"):
         train(state_learner(data), data, SHORT, 12)
@@ -296,16 +298,16 @@ def test_a_loss_that_is_no_longer_finite_stops_the_run():
 
 @pytest.mark.parametrize("most, batches", [(2, 2), (1000, 64)])
 def test_a_test_loss_takes_no_more_batches_than_were_trained_on(monkeypatch, most, batches):
-    learner, asked = state_learner(make_data().states_only()), []
+    learner, asked = state_learner(make_data().but(frames=None)), []
     whole = learner.metrics
     monkeypatch.setattr(learner, "metrics", lambda batch: asked.append(batch) or whole(batch))
-    losses = hold_out_losses(learner, make_data().states_only(), 4, most)
+    losses = hold_out_losses(learner, make_data().but(frames=None), 4, most)
     assert len(asked) == batches
     assert losses["test_loss"] == pytest.approx(np.mean([float(whole(batch)["loss"].detach()) for batch in asked]))
 
 
 def test_without_held_out_episodes_there_is_no_test_loss():
-    data = make_data(held=(False, False, False)).states_only()
+    data = make_data(held=(False, False, False)).but(frames=None)
     assert hold_out_losses(state_learner(data), data, 4, 1) == {}
     with pytest.raises(DmcvbError, match="held-out"):
         data.batch(4, np.random.default_rng(0), hold_out=True)

@@ -37,4 +37,4 @@ def shrink() -> None:
     """Have this process (and those that are forked from it) paint so."""
     from dmcvb_gen.generate import render
 
-    render.make_renderer = lambda name, task, size, **settings: TinyRenderer(name, task, size)
+    render.renderer_class = lambda name: lambda task, size, **settings: TinyRenderer(name, task, size)

@@ -23,7 +23,7 @@ from dmcvb_gen.generate.plan import make_plan, start
 from dmcvb_gen.generate.recipe import expand, load_recipe, make_recipe, narrow, override, shipped_recipes
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.request import make_request
-from dmcvb_gen.policies.actor import random_policy
+from dmcvb_gen.policies.actor import RandomPolicy
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.rendering.opengl import unavailable
@@ -87,7 +87,7 @@ def test_a_release_grows_without_touching_what_is_there(recipe, tmp_path):
 
 def test_an_episode_depends_on_its_index_alone():
     task = get_task("cheetah-run")
-    policies = [random_policy(task)]
+    policies = [RandomPolicy(task)]
     together = simulate(task, policies, [3, 4, 40], 0, ("a", "b"), max_steps=20)
     alone = simulate(task, policies, [40], 0, ("a", "b"), max_steps=20)
     np.testing.assert_array_equal(together.physics[2:], alone.physics)

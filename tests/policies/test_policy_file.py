@@ -14,7 +14,7 @@ from dmcvb_gen import arithmetic
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
 from dmcvb_gen.generate.plan import make_plan
 from dmcvb_gen.generate.recipe import make_recipe
-from dmcvb_gen.policies.actor import Policy, random_policy
+from dmcvb_gen.policies.actor import Policy, RandomPolicy
 from dmcvb_gen.policies.bundled import bundled_policies, resolve_policies
 from dmcvb_gen.policies.header import Evaluation, PolicyHeader, weight_shapes
 from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
@@ -122,7 +122,7 @@ def test_an_action_depends_on_nothing_but_its_own_row(policy_path, deterministic
 
 
 def test_random_actions_are_uniform_from_each_stream():
-    policy = random_policy(get_task("humanoid-walk"))
+    policy = RandomPolicy(get_task("humanoid-walk"))
     draws = np.concatenate(
         [policy.act(np.zeros((2, 67)), [np.random.default_rng(i), np.random.default_rng(99)], True) for i in range(400)]
     )

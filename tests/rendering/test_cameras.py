@@ -24,13 +24,13 @@ FIELDS = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "subtree_com")
 def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task):
     task = get_task(task) if isinstance(task, str) else task_of(task)
     physics = physics_of(task, 5, 4)[:, -1]
-    together = Kinematics(task, FIELDS)(physics)
+    together = Kinematics(task)(physics, FIELDS)
     data, model = mujoco.MjData(task.model), copy.deepcopy(task.model)
     for frame, state in enumerate(physics):
         task.apply_entries(model, state)
         mujoco.mj_setState(model, data, state[: mujoco.mj_stateSize(model, task.physics_spec)], task.physics_spec)
         mujoco.mj_forward(model, data)
-        alone = Kinematics(task, FIELDS)(state[None])
+        alone = Kinematics(task)(state[None], FIELDS)
         for name in FIELDS:
             expected = getattr(data, name)
             np.testing.assert_allclose(together[name][frame].ravel(), expected.ravel(), atol=1e-12)

@@ -14,7 +14,7 @@ from dmcvb_gen.distractors import DistractorSetting, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RenderingError
 from dmcvb_gen.generate import renderer_choice as choice
 from dmcvb_gen.generate.renderer_choice import default_renderer
-from dmcvb_gen.rendering import make_renderer, opengl
+from dmcvb_gen.rendering import opengl, renderer_class
 from dmcvb_gen.tasks import LOCOMOTION_TASKS
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
@@ -132,7 +132,7 @@ def labels_of(task, physics):
 
 def drawn(name, task, physics, labels):
     """(frame, size, size, 3) float: pictures of a renderer."""
-    renderer = make_renderer(name, task, 64)
+    renderer = renderer_class(name)(task, 64)
     pictures = renderer.render(physics, labels)[:, 0].astype(float)
     renderer.close()
     return pictures
@@ -228,7 +228,7 @@ def test_without_opengl_one_line_says_that_nobody_compared(tmp_path, monkeypatch
     [line] = [record.getMessage() for record in caplog.records]
     assert "without a comparison with MuJoCo's own renderer: libEGL is missing; install libegl1" in line
     with pytest.raises(RenderingError, match="'opengl' cannot start here: libEGL is missing; install"):
-        make_renderer("opengl", task, 64)
+        renderer_class("opengl")(task, 64)
 
 
 @needs_opengl
@@ -236,7 +236,7 @@ def test_a_video_needs_a_sky(tmp_path):
     task, physics = task_of(tmp_path, model(sky=""))
     with pytest.raises(RenderingError, match="has no sky to show a video on; add a texture"):
         labels = drawn_labels(task, DistractorSetting("dynamic"), physics[None])
-        make_renderer("opengl", task, 64, backgrounds=load_backgrounds()).render(physics, labels)
+        renderer_class("opengl")(task, 64, backgrounds=load_backgrounds()).render(physics, labels)
 
 
 @pytest.mark.parametrize("difficulty", ["color0.2", "camera0.2-cue0.9", "color0.2-cue0.9"])
@@ -254,7 +254,7 @@ def test_every_pixel_shows_the_geom_that_mujocos_ray_meets(name, share, rtol, tm
     <geom type="sphere" size=".2" pos="-.6 -.4 0"/><geom type="ellipsoid" size=".2 .1 .3" pos="-.6 .4 0"/>
     <geom type="capsule" size=".1 .2" pos=".6 -.4 0"/>"""
     task, physics = task_of(tmp_path, model("cylinder", world=FLOOR + others))
-    renderer = make_renderer(name, task, 64)
+    renderer = renderer_class(name)(task, 64)
     found = renderer.render_labels(physics[:1], labels_of(task, physics[:1]))
     world, data = task.model, mujoco.MjData(task.model)
     mujoco.mj_setState(world, data, physics[0, : mujoco.mj_stateSize(world, task.physics_spec)], task.physics_spec)

@@ -13,10 +13,11 @@ import pytest
 from PIL import Image
 
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering import make_renderer
+from dmcvb_gen.rendering import renderer_class
 from dmcvb_gen.rendering.native import textures
 from dmcvb_gen.rendering.native.textures import background_texels, levels, packed
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
+from dmcvb_gen.tasks.ant_maze.arena import look_numbers
 from tests.conftest import python
 from tests.rendering.test_rendering import FRAMES, frames_of, near, needs_opengl, renderer_of
 from tests.tasks.test_tasks import SUITE
@@ -105,7 +106,7 @@ def test_what_is_painted_once_or_in_part_is_what_the_whole_picture_shows(task_id
 
 def test_what_does_not_move_is_kept_only_as_long_as_it_looks_the_same():
     task, setting, physics, labels = frames_of(MAZE, "none")
-    labels.style[len(physics) // 2 :] = next(look for look in task.looks(3) if look != labels.style[0])
+    labels.style[len(physics) // 2 :] = next(look for look in look_numbers(3) if look != labels.style[0])
     labels.camera_position[-2:, 0] += 0.25
     order = np.argsort(np.arange(len(physics)) % 3, kind="stable")
     renderer = renderer_of("native", task, setting)
@@ -144,9 +145,9 @@ def test_a_background_on_the_sky_is_what_pillow_makes_of_it(shape):
 @pytest.mark.slow
 def test_what_it_does_not_paint_is_refused():
     with pytest.raises(RenderingError, match="dog-walk has geoms of type mesh, .* use --renderer opengl"):
-        make_renderer("native", get_task("dog-walk"), 64)
+        renderer_class("native")(get_task("dog-walk"), 64)
     with pytest.raises(RenderingError, match="4 samples"):
-        make_renderer("native", get_task("walker-walk"), 64, samples=2)
+        renderer_class("native")(get_task("walker-walk"), 64, samples=2)
 
 
 @pytest.mark.slow

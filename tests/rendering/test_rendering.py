@@ -7,7 +7,7 @@ import pytest
 
 from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.generate.renderer_choice import default_renderer
-from dmcvb_gen.rendering import available_renderers, make_renderer
+from dmcvb_gen.rendering import available_renderers, renderer_class
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import get_task
@@ -36,8 +36,8 @@ def frames_of(task_id, setting_name, count=FRAMES):
 
 
 def renderer_of(name, task, setting, size=64, **options):
-    return make_renderer(
-        name, task, size, backgrounds=load_backgrounds(), floor_alpha=floor_alpha_for(task, setting), **options
+    return renderer_class(name)(
+        task, size, backgrounds=load_backgrounds(), floor_alpha=floor_alpha_for(task, setting), **options
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 from dm_env import specs
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.policies.actor import random_policy
+from dmcvb_gen.policies.actor import RandomPolicy
 from dmcvb_gen.policies.simulate import replay, simulate
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import get_task
@@ -101,7 +101,7 @@ def task_of(case):
 
 
 def rolled(task, episodes, max_steps=None):
-    return simulate(task, [random_policy(task)], episodes, SEED, NAMES, max_steps=max_steps)
+    return simulate(task, [RandomPolicy(task)], episodes, SEED, NAMES, max_steps=max_steps)
 
 
 def numbers(model):

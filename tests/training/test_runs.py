@@ -372,7 +372,7 @@ def test_evaluations_keep_to_their_share_of_the_steps_however_often_they_are(tmp
 
     def counted(policy, task, episodes=100, **given):
         asked.append(episodes * task.max_steps)
-        return known, None
+        return known
 
     monkeypatch.setattr(runs, "EVALUATION_EPISODES", 20)
     monkeypatch.setattr("dmcvb_gen.training.guided.TIMES_MORE_EPISODES", 3)

@@ -74,8 +74,8 @@ def _moved(
     """Where points (frame, row, column, 3) of geoms (frame, row, column) are after they moved with their geoms."""
     from dmcvb_gen.tasks.cameras import Kinematics
 
-    kinematics = Kinematics(task, ("geom_xpos", "geom_xmat"))
-    before, after = kinematics(physics), kinematics(next_physics)
+    fields = ("geom_xpos", "geom_xmat")
+    before, after = (Kinematics(task)(states, fields) for states in (physics, next_physics))
     frame = np.arange(len(world))[:, None, None]
     shape = (len(world), -1, 3, 3)
     turn = np.einsum("fgij,fgkj->fgik", after["geom_xmat"].reshape(shape), before["geom_xmat"].reshape(shape))

@@ -208,27 +208,23 @@ def drawn(rec, g, which):
 
 
 @part
-def draw_body(inverse, number, rays, k, rec, g, place, axis):
-    """Draw a body; its center and axis are in these columns of its record."""
-    c0, c1, r0, r1 = visibility.box_of_body(k, rec, g, place, axis, rays.size // 9)
-    if c0 >= c1 or r0 >= r1:
-        return
-    nearest, geom = 1.0 / k[L.NEAR], np.uint8(g)
-    if rec[g, L.KIND] == CAPSULE:
-        visibility.draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
-    elif rec[g, L.KIND] == SPHERE:
-        visibility.draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
-    else:
-        turn = i8(L.TURN if place == L.PLACE else L.MIRRORED_TURN)
-        visibility.draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom)
-
-
-@part
 def draw_bodies(inverse, number, rays, k, rec, which, place, axis):
-    """Draw all bodies (`drawn`)."""
+    """Draw all bodies (`drawn`); their centers and axes are in these columns of their records."""
+    nearest = 1.0 / k[L.NEAR]
     for g in range(rec.shape[0]):
-        if rec[g, L.KIND] != PLANE and drawn(rec, g, which):
-            draw_body(inverse, number, rays, k, rec, g, place, axis)
+        if rec[g, L.KIND] == PLANE or not drawn(rec, g, which):
+            continue
+        c0, c1, r0, r1 = visibility.box_of_body(k, rec, g, place, axis, rays.size // 9)
+        geom = np.uint8(g)
+        if c0 >= c1 or r0 >= r1:
+            continue
+        if rec[g, L.KIND] == CAPSULE:
+            visibility.draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
+        elif rec[g, L.KIND] == SPHERE:
+            visibility.draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
+        else:
+            turn = i8(L.TURN if place == L.PLACE else L.MIRRORED_TURN)
+            visibility.draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom)
 
 
 @part

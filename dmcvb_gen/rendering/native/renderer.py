@@ -11,7 +11,7 @@ import numpy as np
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import RenderingError
-from dmcvb_gen.rendering.base import Renderer, Views, check_frames, check_size, empty_labels, moved_lamps
+from dmcvb_gen.rendering.base import Renderer, Views, check_frames, empty_labels, moved_lamps
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.frame import Frames, SceneConstants, label_frames, make_scratch, paint_frames
 from dmcvb_gen.rendering.native.scene import PLANE, SUN_DISTANCE, Scene, records_of, scene_of
@@ -41,10 +41,9 @@ class NativeRenderer(Renderer):
         scene_of(task)
 
     def __init__(self, task: Task, size: int, *, backgrounds=None, floor_alpha=1.0, samples: int | None = None):
-        check_size(size)
+        super().__init__(task, size, backgrounds=backgrounds, floor_alpha=floor_alpha)
         if samples not in (None, self.samples):
             raise RenderingError(f"renderer 'native' takes {self.samples} samples a pixel, not {samples}; give none")
-        self.task, self.size, self.floor_alpha = task, size, float(floor_alpha)
         self._scene = scene = scene_of(task)
         self._angles = np.radians(task.model.cam_fovy[camera_ids(task)]).tolist()
         finest = min(_finest_level(size, angle) for angle in self._angles)
@@ -55,7 +54,7 @@ class NativeRenderer(Renderer):
         fields = ["geom_xpos", "geom_xmat"]
         fields += ["site_xpos", "site_xmat"] * bool(len(scene.sites) or len(scene.cords))
         fields += ["light_xpos", "light_xdir"] * bool(len(scene.lamps))
-        self._kinematics = Kinematics(task, fields)
+        self._kinematics, self._fields = Kinematics(task), fields
         moving_planes = scene.rec[scene.rec[:, L.KIND] == PLANE, L.MOVING]
         self._stays = scene.constants[L.MIRROR] < 0 and not len(scene.lamps) and not moving_planes.any()
         sun = task.model.light_type[scene.lamps] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
@@ -79,7 +78,7 @@ class NativeRenderer(Renderer):
         indices = check_frames(self.task, physics, exogenous, views)
         shape = (len(indices), self.size, self.size, 3)
         out = [np.empty((len(physics) * asked, *shape), np.uint8) for asked in (shown, hidden)]
-        for rows, poses in self._parts(physics, exogenous):
+        for rows, poses in self._parts(physics):
             pictures = [np.empty((len(rows) * asked, *shape[1:]), np.uint8) for asked in (shown, hidden)]
             for column, view in enumerate(indices):
                 frames, scene = self._frames(poses, exogenous[rows], view), self._constants(view)
@@ -93,7 +92,7 @@ class NativeRenderer(Renderer):
         indices = check_frames(self.task, physics, exogenous, views)
         depth, segmentation = empty_labels(len(physics), len(indices), self.size)
         numbers = np.append(self._scene.geoms, -1).astype(np.int16)
-        for rows, poses in self._parts(physics, exogenous):
+        for rows, poses in self._parts(physics):
             if hide_goal:
                 poses["geom_xpos"][:, list(self.task.goal_geoms), 2] = OUT_OF_SIGHT
             deep = np.empty((len(rows), self.size, self.size), np.float32)
@@ -106,17 +105,12 @@ class NativeRenderer(Renderer):
 
     # -- arguments ----------------------------------------------------------------------------
 
-    def _parts(self, physics: np.ndarray, exogenous: DistractorState) -> Iterator[tuple[np.ndarray, dict]]:
-        """Frames to paint together, with their poses: never more backgrounds than there is room for."""
-        order = np.lexsort((exogenous.background_frame, exogenous.background_video))
-        keys = np.stack([exogenous.background_video[order], exogenous.background_frame[order]], axis=1)
-        ordinal = np.concatenate([[0], np.cumsum((keys[1:] != keys[:-1]).any(axis=1))])
-        first = 0
-        while first < len(order):
-            past = int(np.searchsorted(ordinal, ordinal[first] + max(self._textures.slots, 1)))
-            rows = np.sort(order[first : min(past, first + CHUNK)])
-            yield rows, self._kinematics(physics[rows])
-            first += len(rows)
+    def _parts(self, physics: np.ndarray) -> Iterator[tuple[np.ndarray, dict]]:
+        """Frames to paint together, with their poses: never more than there is room for backgrounds."""
+        together = min(self._textures.slots or CHUNK, CHUNK)
+        for first in range(0, len(physics), together):
+            rows = np.arange(first, min(first + together, len(physics)))
+            yield rows, self._kinematics(physics[rows], self._fields)
 
     def _frames(self, poses: dict[str, np.ndarray], exogenous: DistractorState, view: int) -> Frames:
         scene, count = self._scene, len(exogenous)

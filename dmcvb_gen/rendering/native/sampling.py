@@ -77,23 +77,30 @@ def add_texels(s, i, texels, base, columns, left, right, top, bottom, across, do
 
 
 @part
-def add_repeating(s, n, texels, at, last, further, weight, slope):
+def add_level(s, n, texels, at, repeats, many, last, further, weight, slope):
     """Add one level's color at (S, T) to TEXEL, `weight + slope * MIX` times.
 
     Args:
       at: where in `texels` the table of textures has the texture's first level; `further`: 1 for the coarser level.
+      repeats: the texture repeats; else its coordinates end at an edge, as those of a cube map's face.
+      many: 1 if a cube map's faces differ, else 0.
     """
     distinct()
     for i in range(n):
         entry = at + 3 * min(i4(get(s, L.LEVEL + i)) + further, last)
         base, columns, rows = get(texels, entry), get(texels, entry + 1), get(texels, entry + 2)
         x, y = get(s, L.S + i), get(s, L.T + i)
-        x, y = (x - np.floor(x)) * f4(columns) + f4(0.5), (y - np.floor(y)) * f4(rows) + f4(0.5)
+        x, y = x - np.floor(x) if repeats else x, y - np.floor(y) if repeats else y
+        x, y = x * f4(columns) + f4(0.5), y * f4(rows) + f4(0.5)
         right, bottom = i4(x), i4(y)
         across, down = np.floor(f4(256) * (x - f4(right))), np.floor(f4(256) * (y - f4(bottom)))
         left, top = i4(right - i4(1)), i4(bottom - i4(1))
-        left, top = left if left >= 0 else i4(columns - i4(1)), top if top >= 0 else i4(rows - i4(1))
-        right, bottom = right if right < columns else i4(0), bottom if bottom < rows else i4(0)
+        far_right, far_bottom = i4(columns - i4(1)), i4(rows - i4(1))
+        left = left if left >= 0 else (far_right if repeats else i4(0))
+        top = top if top >= 0 else (far_bottom if repeats else i4(0))
+        right = right if right < columns else (i4(0) if repeats else far_right)
+        bottom = bottom if bottom < rows else (i4(0) if repeats else far_bottom)
+        base = i4(base + i4(many * i4(get(s, L.FACE + i))) * i4(columns * rows))
         share = (weight + slope * get(s, L.MIX + i)) * f4(SHARE_UNIT)
         add_texels(s, i, texels, base, columns, left, right, top, bottom, across, down, share)
 
@@ -108,9 +115,9 @@ def sample_repeating(s, n, texels, width, texture):
     at = texture * width
     last = i4(texels[at + L.LEVELS] - 1)
     mixed = choose_levels(s, n, last)
-    add_repeating(s, n, texels, at + L.FIRST, last, i4(0), f4(256), f4(-1))
+    add_level(s, n, texels, at + L.FIRST, True, i4(0), last, i4(0), f4(256), f4(-1))
     if mixed:
-        add_repeating(s, n, texels, at + L.FIRST, last, i4(1), f4(0), f4(1))
+        add_level(s, n, texels, at + L.FIRST, True, i4(0), last, i4(1), f4(0), f4(1))
 
 
 @leaf
@@ -159,33 +166,12 @@ def face_cube(s, n, half):
 
 
 @part
-def add_clamped(s, n, texels, at, many, last, further, weight, slope):
-    """Do as `add_repeating` for a cube map, whose coordinates end at a face's edge.
-
-    Args:
-      many: 1 if the faces differ, else 0.
-    """
-    distinct()
-    for i in range(n):
-        entry = at + 3 * min(i4(get(s, L.LEVEL + i)) + further, last)
-        base, side = get(texels, entry), get(texels, entry + 1)
-        x, y = get(s, L.S + i) * f4(side) + f4(0.5), get(s, L.T + i) * f4(side) + f4(0.5)
-        right, bottom = i4(x), i4(y)
-        across, down = np.floor(f4(256) * (x - f4(right))), np.floor(f4(256) * (y - f4(bottom)))
-        left, top = max(i4(right - i4(1)), i4(0)), max(i4(bottom - i4(1)), i4(0))
-        right, bottom = min(right, i4(side - i4(1))), min(bottom, i4(side - i4(1)))
-        base = i4(base + i4(many * i4(get(s, L.FACE + i))) * i4(side * side))
-        share = (weight + slope * get(s, L.MIX + i)) * f4(SHARE_UNIT)
-        add_texels(s, i, texels, base, side, left, right, top, bottom, across, down, share)
-
-
-@part
 def sample_cube(s, n, texels, width, texture):
     """Sample a cube map in a direction with its changes to the right and upwards. See `sample_repeating`."""
     at = texture * width
     last, many = i4(texels[at + L.LEVELS] - 1), i4(1 if texels[at + L.FACES] > 1 else 0)
     face_cube(s, n, f4(0.5) * f4(texels[at + L.FIRST + 1]))
     mixed = choose_levels(s, n, last)
-    add_clamped(s, n, texels, at + L.FIRST, many, last, i4(0), f4(256), f4(-1))
+    add_level(s, n, texels, at + L.FIRST, False, many, last, i4(0), f4(256), f4(-1))
     if mixed:
-        add_clamped(s, n, texels, at + L.FIRST, many, last, i4(1), f4(0), f4(1))
+        add_level(s, n, texels, at + L.FIRST, False, many, last, i4(1), f4(0), f4(1))

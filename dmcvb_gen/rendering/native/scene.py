@@ -95,7 +95,8 @@ def scene_of(task: Task) -> Scene:
     seen = np.flatnonzero(alpha > 0)
     numbers = np.concatenate([geoms, np.full(len(sites) + len(cords), -1)])
     bodies = np.concatenate([model.geom_bodyid[geoms], model.site_bodyid[sites]])
-    moving = np.concatenate([_moves(model, bodies), np.ones(len(cords), bool)])
+    moving = (model.body_weldid[bodies] != 0) | (model.body_mocapid[bodies] >= 0)
+    moving = np.concatenate([moving, np.ones(len(cords), bool)])
     geoms, kind, size = numbers[seen], kind[seen], size[seen]
     material, rgba = material[seen], rgba[seen]
     first, second = len(numbers) - len(sites) - len(cords), len(numbers) - len(cords)
@@ -121,7 +122,9 @@ def scene_of(task: Task) -> Scene:
     constants = np.zeros(L.HORIZON + 1)
     constants[L.NEAR], constants[L.FAR], constants[L.HORIZON] = near, far, SKY_DISTANCE * far if len(skies) else 1e9
     constants[L.MIRROR], constants[L.REFLECTANCE] = (mirror[0], shiny[mirror[0]]) if len(mirror) else (-1, 0)
-    constants[L.HEADLIGHT : L.SPOT], constants[L.SPOT : L.LINES] = _headlight(model), shine[0]
+    headlight = np.concatenate([model.vis.headlight.ambient, model.vis.headlight.diffuse, model.vis.headlight.specular])
+    constants[L.HEADLIGHT : L.SPOT] = headlight * bool(model.vis.headlight.active)
+    constants[L.SPOT : L.LINES] = shine[0]
     constants[L.LINES : L.GRID], constants[L.GRID] = lines, grid.shape[1]
     return Scene(
         geoms=geoms,
@@ -205,10 +208,6 @@ def _visible_sites(model: mujoco.MjModel) -> np.ndarray:
     return sites[~hidden]
 
 
-def _moves(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
-    return (model.body_weldid[bodies] != 0) | (model.body_mocapid[bodies] >= 0)
-
-
 def _of_materials(values: np.ndarray, material: np.ndarray) -> np.ndarray:
     """A field of the materials for each of `material`; zeros in a model that has none."""
     return values[material] if len(values) else np.zeros((len(material), *values.shape[1:]), values.dtype)
@@ -284,11 +283,6 @@ def _refuse_what_is_not_painted(
     for what, there in faults.items():
         if there:
             raise _not_painted(task, what)
-
-
-def _headlight(model: mujoco.MjModel) -> np.ndarray:
-    light = model.vis.headlight
-    return np.concatenate([light.ambient, light.diffuse, light.specular]).astype(np.float64) * bool(light.active)
 
 
 def _shine(model: mujoco.MjModel, lamp: int) -> np.ndarray:

@@ -12,7 +12,6 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 
-from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.layout import distinct, entry, get, leaf, part, put
 
@@ -168,8 +167,6 @@ class Textures:
         """The texture of a video's frame, made now if need be; stays for the next `slots` - 1 others."""
         key = video, frame
         if key not in self._slot:
-            if self._backgrounds is None:
-                raise RenderingError("labels name a background video, but the renderer was made without backgrounds")
             full = len(self._slot) >= self.slots
             texture = self._slot.popitem(last=False)[1] if full else self._model.ntex + len(self._slot)
             texels = background_texels(self._backgrounds.frames(video)[frame], self._room)

@@ -166,8 +166,5 @@ def fixed_pairs(layout: Layout, count: int, seed: int) -> list[tuple[tuple[int, 
         )
     rng = np.random.default_rng([seed, 0xF1ED])
     chosen = rng.permutation(cells * (cells - 1))[:count]
-    pairs = []
-    for number in chosen:
-        start, goal = divmod(int(number), cells - 1)
-        pairs.append((layout.free[start], layout.free[goal + (goal >= start)]))
-    return pairs
+    places = (divmod(number, cells - 1) for number in chosen.tolist())
+    return [(layout.free[start], layout.free[goal + (goal >= start)]) for start, goal in places]

@@ -14,16 +14,7 @@ import numpy as np
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.spec import ANT_MAZE
-from dmcvb_gen.tasks.ant_maze.arena import (
-    ACTIONS,
-    CAMERAS,
-    GOAL_HEIGHT,
-    GOAL_RADIUS,
-    STYLES,
-    build_arena,
-    look_numbers,
-    textured_model,
-)
+from dmcvb_gen.tasks.ant_maze import arena
 from dmcvb_gen.tasks.ant_maze.distance import PIXELS, blend, geodesic_field, look_up, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import Layout
 from dmcvb_gen.tasks.base import ACTION_REPEAT, Generators, PhysicsBatch, Places, Task
@@ -60,24 +51,11 @@ FIELDS = {
     "world_zaxis": 3,
     "walker_position": 3,
 }
-BEHAVIOUR_FIELDS = (
-    "target_position",
-    "target_vector",
-    "body_height",
-    "egocentric_target_vector",
-    "end_effectors_pos",
-    "joints_pos",
-    "joints_vel",
-    "sensors_gyro",
-    "sensors_touch",
-    "sensors_velocimeter",
-    "world_zaxis",
-    "walker_position",
-)
-"""What behaviour policies see: parts of the state, but for the vectors to the goal, which are true ones in meters.
-
-What is left out follows from the joints, or is noise (the accelerometer).
-"""
+UNSEEN = {"distance_to_target", "target_activated", "appendages_pos", "bodies_pos", "bodies_quats"}
+UNSEEN |= {"sensors_accelerometer"}
+"""Fields that behaviour policies do not see: they follow from the joints, are noise, or are the reward's."""
+BEHAVIOUR_FIELDS = tuple(name for name in FIELDS if name not in UNSEEN)
+"""What behaviour policies see: parts of the state, but for the vectors to the goal, which are true ones in meters."""
 
 
 class AntMazeBatch(PhysicsBatch):
@@ -86,10 +64,7 @@ class AntMazeBatch(PhysicsBatch):
     def __init__(self, task: AntMaze, size: int, threads: int = 1):
         super().__init__(task, size, threads)
         bind, model = self.sims.bind, task.model
-        self._qpos, self._qvel, self._mocap = bind("qpos"), bind("qvel"), bind("mocap_pos")
-        self._xmat, self._xpos = bind("xmat"), bind("xpos")
-        self._geom_xpos, self._geom_xmat = bind("geom_xpos"), bind("geom_xmat")
-        self._sensors = bind("sensordata")
+        self._mocap, self._geom_xpos, self._geom_xmat = bind("mocap_pos"), bind("geom_xpos"), bind("geom_xmat")
         self._torso = model.body("walker/torso").id
         self._ant = np.array([i for i in range(model.ngeom) if model.geom(i).name.startswith("walker/")])
         capsule = model.geom_type[self._ant] == mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -172,9 +147,11 @@ class AntMazeBatch(PhysicsBatch):
 
     def _advance(self, ids):
         ids = self._all if ids is None else ids
-        left, gaps = np.full(len(ids), self.task.substeps), self._gaps(ids)
+        whole, gaps = self.task.substeps, self._gaps(ids)
+        left = np.full(len(ids), whole)
         while len(ids):  # a touch counts at any physics step, as in dm_control
-            count = np.minimum(left, self._steps_without_touch(gaps))
+            count = np.select([gaps >= NEAR, gaps >= NEAR / 5], [whole, whole // 5], 1)
+            count = np.minimum(left, count)  # steps that cannot end in a touch; 1 if the next one can
             for steps in np.unique(count).tolist():
                 some = ids[count == steps]
                 self.sims.step(ids=some, nstep=steps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))
@@ -183,36 +160,27 @@ class AntMazeBatch(PhysicsBatch):
             left = left - count
             ids, gaps, left = ids[left > 0], gaps[left > 0], left[left > 0]
 
-    def _steps_without_touch(self, gaps: np.ndarray) -> np.ndarray:
-        """(n,) meters to the goal -> (n,) int, physics steps that cannot end in a touch; 1 if the next one can."""
-        steps = self.task.substeps
-        return np.select([gaps >= NEAR, gaps >= NEAR / 5], [steps, steps // 5], 1)
-
     def _gaps(self, ids: np.ndarray) -> np.ndarray:
         """(len(ids),) meters between the goal's sphere and the ant's nearest geom, negative where they overlap.
 
         Infinite for ants so far away that none of their geoms is near.
         """
-        to_torso = self._mocap[ids, 0, :2] - self._xpos[ids, self._torso, :2]
-        gaps = np.full(len(ids), np.inf)
+        goal, gaps = self.goal()[ids], np.full(len(ids), np.inf)
+        to_torso = goal[:, :2] - self._xpos[ids, self._torso, :2]
         close = np.flatnonzero((to_torso * to_torso).sum(axis=1) < (REACH + NEAR) ** 2)
-        if len(close):
-            gaps[close] = self._gaps_of_geoms(ids[close])
-        return gaps
-
-    def _gaps_of_geoms(self, ids: np.ndarray) -> np.ndarray:
-        geoms = np.ix_(ids, self._ant)
+        geoms = np.ix_(ids[close], self._ant)
         centers, axes = self._geom_xpos[geoms], self._geom_xmat[geoms][..., 2::3]
-        to_goal = (self._mocap[ids, 0] + [0, 0, GOAL_HEIGHT])[:, None] - centers
+        to_goal = goal[close, None] - centers
         along = np.clip((to_goal * axes).sum(axis=-1), -self._half, self._half)
         away = np.linalg.norm(to_goal - along[..., None] * axes, axis=-1)
-        return (away - self._radius).min(axis=1) - GOAL_RADIUS
+        gaps[close] = (away - self._radius).min(axis=1) - arena.GOAL_RADIUS
+        return gaps
 
     # -- what it gives ------------------------------------------------------------------------
 
     def goal(self) -> np.ndarray:
         """(size, 3): center of the goal's sphere, meters."""
-        return self._mocap[:, 0] + [0, 0, GOAL_HEIGHT]
+        return self._mocap[:, 0] + [0, 0, arena.GOAL_HEIGHT]
 
     def behaviour_observation(self):
         position, goal = self._xpos[:, self._torso], self.goal()
@@ -248,7 +216,7 @@ class AntMazeBatch(PhysicsBatch):
             "target_activated": self._touched[:, None],
             "appendages_pos": values["end_effectors_pos"],
             # As released: not to the goal, but to a point above the middle of the maze (SPEC, section 3).
-            "egocentric_target_vector": self._egocentric(np.array([0, 0, GOAL_HEIGHT]) - position),
+            "egocentric_target_vector": self._egocentric(np.array([0, 0, arena.GOAL_HEIGHT]) - position),
             "walker_position": position,
         }
         return np.concatenate([np.asarray(values[name], np.float64) for name in FIELDS], axis=1)
@@ -299,8 +267,8 @@ class AntMaze(Task):
     behaviour_size = sum(FIELDS[name] for name in BEHAVIOUR_FIELDS)
     max_steps, evaluation_steps = EPISODE_STEPS, EVALUATION_STEPS
     substeps = 25  # 1 ms physics, 25 ms control
-    views = tuple(CAMERAS)
-    cameras = tuple(CAMERAS.values())
+    views = tuple(arena.CAMERAS)
+    cameras = tuple(arena.CAMERAS.values())
     return_range = (-float(ACTION_REPEAT * EPISODE_STEPS), 0.0)
     unstored_fields = ("sensors_accelerometer", "sensors_touch", "target_activated")
     """Fields of a state that depend on the step before it, so that a physics state alone does not give them."""
@@ -310,29 +278,25 @@ class AntMaze(Task):
 
     @property
     def model(self):
-        return build_arena(self.layout).model
+        return arena.build_arena(self.layout).model
 
     @property
     def picture_model(self):
-        return textured_model(self.layout)
+        return arena.textured_model(self.layout)
 
     @property
     def action_size(self):
-        return ACTIONS  # plans ask for it, and need no model
+        return arena.ACTIONS  # plans ask for it, and need no model
 
     @functools.cached_property
     def goal_geoms(self) -> tuple[int, ...]:  # type: ignore[override]
-        return (build_arena(self.layout).goal_geom,)
+        return (arena.build_arena(self.layout).goal_geom,)
 
     def styles(self, split):
-        return STYLES[split]
-
-    def looks(self, style: int) -> tuple[int, ...]:
-        """The looks of a labmaze style: combinations of its wall and floor textures."""
-        return look_numbers(style)
+        return tuple(map(arena.look_numbers, arena.STYLES[split]))
 
     def style_geom_matid(self, look):
-        return build_arena(self.layout).looks.get(look)
+        return arena.build_arena(self.layout).looks.get(look)
 
     def batch(self, size: int, threads: int = 1) -> AntMazeBatch:
         return AntMazeBatch(self, size, threads)
