@@ -58,7 +58,7 @@ class Wanted:
         Raises:
           UnknownNameError: it has no such view.
         """
-        views = Pictures(record.views).select(self.views if len(record.views) > 1 else None).views
+        views = Pictures(record.views).select(self.views).views
         names = {*Pictures(views).arrays, *Pictures(views, hide_goal=True).arrays}
         return tuple(name for name in all_pictures(record) if name in names)
 

@@ -114,7 +114,7 @@ def make_plan(
     elif there is not None:
         resolution, release = None, there
     else:
-        raise StoreError(f"{store.place} holds no release to go on with; begin one with TASKs or --recipe")
+        raise StoreError(f"{store.place} holds no release to go on with; give TASKs or --recipe")
     works = works_of(release, only, episodes, part=part)
     everything = works_of(release, only, episodes, wanted=lambda layer, shard: True)
     return Plan(release, resolution, works, episodes_left(everything), there is not None)

@@ -130,14 +130,13 @@ def _recipe_of(tasks: Sequence[str], levels: Sequence[str], settings: Sequence[s
     """The recipe of tasks of one family, with the counts that `override` then changes."""
     for level in levels:
         Level.parse(level)
-    for task in tasks:
-        get_task(task)  # a wrong name is told before its settings are
     mazes = {is_maze(task) for task in tasks}
     if len(mazes) > 1:
         raise RecipeError("mazes and locomotion tasks take different settings; roll them out by a --recipe")
     if strange := [name for name in settings if (name in GOAL_MODES) != (True in mazes)]:
         if True in mazes:
             raise RecipeError("--distractor has no effect in mazes, which vary in style; ask for --goal visible")
+        get_task(tasks[0])  # or it is a maze's name, misspelt
         raise RecipeError(f"{tasks[0]} has no goal {strange[0]}; --goal is for mazes, ask for --distractor")
     words = [*map(task_folder, tasks), *levels, *([f"repeat{repeat}"] if repeat != ACTION_REPEAT else [])]
     name = "-".join(dict.fromkeys(words))[:80].rstrip("-.")
