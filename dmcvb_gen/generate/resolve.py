@@ -222,8 +222,8 @@ def code_of_task(task: str) -> str:
     """The digest of the file and the model of a task of one's own, else ""."""
     if not is_own(task):
         return ""
-    found = source_digest(task.partition(":")[0]) + model_digest(get_task(task).model)
-    return hashlib.sha256(found.encode()).hexdigest()
+    model = model_digest(get_task(task).model)  # which imports the file
+    return hashlib.sha256((source_digest(task.partition(":")[0]) + model).encode()).hexdigest()
 
 
 def code_of_distractor(setting: DistractorSetting) -> list[str]:

@@ -183,10 +183,10 @@ def _verification(
         counts["steps"] += subset.steps
     lacking = [subset for subset in sound if len(subset) < subset.record.episodes]
     incomplete = {subset.name: (len(subset), subset.record.episodes) for subset in lacking}
-    if not findings:
-        incomplete |= release.shortfalls
     unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
     faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
+    if not faults:
+        incomplete |= release.shortfalls
     return Verification(counts, faults, incomplete, release.digest, release.compared, unchecked, covered)
 
 

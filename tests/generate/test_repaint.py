@@ -17,6 +17,7 @@ from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
 from tests.conftest import records, rewrite, roll_out, short_recipe
+from tests.distractors.test_backgrounds import write_frames
 
 
 @pytest.fixture
@@ -32,6 +33,15 @@ def dynamic(small_release, tmp_path_factory):
 
 
 NAME = "walker-walk/random/dynamic"
+
+
+def test_a_subset_without_videos_is_repainted_with_those_of_the_others(tmp_path):
+    for split in ("train", "val"):
+        write_frames(tmp_path / "videos" / split / "a", [np.full((16, 16, 3), 90, np.uint8)] * 3, "png")
+    roll_out(short_recipe(backgrounds=str(tmp_path / "videos")), tmp_path / "r")
+    repaint(Repainting(tmp_path / "r", tmp_path / "new", ["*/*/none"], distractor="static"), 1)
+    [new], old = Release.open(tmp_path / "new").manifest.subsets, Release.open(tmp_path / "r")[NAME].record
+    assert new.backgrounds == old.backgrounds and new.backgrounds["source"] != "builtin"
 
 
 def test_a_repainted_subset_has_the_records_of_a_rolled_out_one(small_release, dynamic):

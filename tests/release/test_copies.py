@@ -123,6 +123,17 @@ def test_a_grown_release_takes_the_place_of_the_older(made, place, tmp_path):
         fetch(f"file:{tmp_path / 'old'}", back)
 
 
+def test_a_release_that_grew_under_another_name_takes_the_place_of_the_older(made, tmp_path, caplog):
+    publish(made, url := f"file:{tmp_path / 'there'}")
+    begin(open_store(made), recipe(4, name="aaa"), {})
+    assert verify(made).incomplete == {"hop/random/none": (3, 4), "hop/random/dynamic": (3, 4)}
+    publish(made, url)
+    assert "lacks a part of hop/random/dynamic, which stays unpublished" in caplog.text
+    make(open_store(made), recipe(4, name="aaa"))
+    publish(made, url)
+    assert len(Release.open(url)["hop/random/none"]) == 4
+
+
 def test_a_publish_without_images_goes_on_and_leaves_images_that_are_there(made, tmp_path):
     light, whole = tmp_path / "light", tmp_path / "whole"
     publish(made, f"file:{light}", pixels=False)

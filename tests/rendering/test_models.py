@@ -232,6 +232,16 @@ def test_without_opengl_one_line_says_that_nobody_compared(tmp_path, monkeypatch
 
 
 @needs_opengl
+def test_a_renderer_that_closes_takes_nothing_from_another():
+    task, _, physics, labels = frames_of("walker-walk", "none")
+    first, second = (renderer_class("opengl")(task, 32) for _ in range(2))
+    before = second.render(physics, labels)
+    first.render(physics, labels)
+    del first
+    np.testing.assert_array_equal(second.render(physics, labels), before)
+
+
+@needs_opengl
 def test_a_video_needs_a_sky(tmp_path):
     task, physics = task_of(tmp_path, model(sky=""))
     with pytest.raises(RenderingError, match="has no sky to show a video on; add a texture"):

@@ -12,12 +12,14 @@ from dm_control.utils import rewards
 
 from dmcvb_gen.arithmetic import to_unit
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.generate.resolve import code_of_task
 from dmcvb_gen.own_code import TASKS as ALLOWED
 from dmcvb_gen.own_code import allow
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, PHYSICS_SPEC, get_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
 from tests.conftest import invoke, rewrite, roll_out, small_recipe
+from tests.tasks.hostile_tasks import ARM
 from tests.tasks.test_own_tasks import check_episode, rolled
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
@@ -174,6 +176,17 @@ def test_a_release_of_ones_own_task_is_verified_by_replay_and_not_checked_withou
     found = verify(tmp_path / "r")
     assert found.sound and not found.complete and "set DMCVB_GEN_TASKS=arm_tasks:ends" in str(found.unchecked[0])
     invoke("verify", tmp_path / "r", code=3)
+
+
+def test_another_model_of_the_same_code_is_another_task(tmp_path, monkeypatch):
+    ten_lines(tmp_path, monkeypatch, OWN)
+    monkeypatch.setenv(ALLOWED, "arm_tasks:from_file")
+    before = code_of_task("arm_tasks:from_file")
+    get_task.cache_clear()
+    assert code_of_task("arm_tasks:from_file") == before
+    monkeypatch.setattr("arm_tasks.ARM", ARM.replace('size=".05"', 'size=".06"'))
+    get_task.cache_clear()
+    assert code_of_task("arm_tasks:from_file") != before
 
 
 def test_a_class_of_ones_own_steps_a_batch_by_itself(tmp_path, monkeypatch):
