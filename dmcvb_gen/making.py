@@ -280,6 +280,7 @@ def repaint(
     Raises:
       DmcvbError: nothing fits, a shard is damaged, or `out` cannot be used.
     """
+    from dmcvb_gen.dataset.manifest import check_name
     from dmcvb_gen.distractors.registry import typed_setting
     from dmcvb_gen.generate.repaint import Repainting
     from dmcvb_gen.generate.repaint import repaint as run
@@ -288,7 +289,7 @@ def repaint(
 
     videos = None if backgrounds is None else background_source(backgrounds)
     setting = None if distractor is None else typed_setting(distractor)
-    look = (setting, size, renderer, samples, videos, split, as_names(labels), name)
+    look = (setting, size, renderer, samples, videos, split, as_names(labels), name and check_name(name))
     with progress_bar(progress, " frames") as bar:
         run(Repainting(release, out, as_names(only), *look), workers, bar)
     return open_for_reading(str(out))

@@ -57,6 +57,17 @@ Line = Annotated[str, pydantic.StringConstraints(pattern=r"^[^\x00-\x1f\x7f-\x9f
 PlainName = Annotated[str, pydantic.StringConstraints(pattern=PLAIN_NAME, max_length=200)]
 
 
+def check_name(name: str) -> str:
+    """Return a release's name.
+
+    Raises:
+      StoreError: it is too long, or has other characters than paths and pages can hold.
+    """
+    if not re.fullmatch(PLAIN_NAME, name) or len(name) > 200:
+        raise StoreError(f"{name[:80]!r} is no name of a release; give letters, digits, and any of _ . + -")
+    return name
+
+
 class _Model(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release, recorded_shards
-from dmcvb_gen.dataset.manifest import IMPORTED, MAX_STEPS, Layer, Resolved, SubsetRecord, shard_size
+from dmcvb_gen.dataset.manifest import IMPORTED, MAX_STEPS, Layer, Resolved, SubsetRecord, check_name, shard_size
 from dmcvb_gen.dataset.pictures import picture_arrays
 from dmcvb_gen.dataset.schema import image_array, trajectory_arrays
 from dmcvb_gen.dataset.writer import begin, finish, put_shard, write_provenance
@@ -97,6 +97,7 @@ def import_tfds(
     Raises:
       StoreError: there is no TFDS folder, it is damaged, lacks files or has other features, or `out` cannot be used.
     """
+    check_name(name)
     target = local_path(out)
     found = sorted(path.parent for path in Path(folder).rglob("features.json"))
     if not found:
