@@ -199,10 +199,10 @@ def evaluate_behaviour(as_json, progress, **options):
     rows = evaluate(**options)
     if as_json:
         return print_json(rows)
-    _show_returns(rows, options["episodes"], options["seed"])
+    _show_returns(rows, options["seed"])
 
 
-def _show_returns(rows, episodes, seed):
+def _show_returns(rows, seed):
     """Print returns, the paper's under each."""
     mazes = any("success" in row for row in rows)
     mode = next((row["mode"] for row in rows if row["level"] != "random"), "random")  # random actions have no mean
@@ -218,9 +218,10 @@ def _show_returns(rows, episodes, seed):
         if row["paper"]:
             numbers = [f"{row['paper'][key]:.1f}" for key in statistics]
             lines.append(("  DMC-VB paper", row["level"], *numbers, *[""] * len(scores)))
+    counts = " or ".join(map(str, sorted({row["episodes"] for row in rows})))
     print_table(
         ("task", "<level", *statistics, *scores),
         lines,
-        title=f"{episodes} episodes each, seed {seed}" + ("" if mode == "own" else f", {mode} actions"),
+        title=f"{counts} episodes each, seed {seed}" + ("" if mode == "own" else f", {mode} actions"),
         optional=(("p25", "p75"), ("min", "max"), ("to goal m/s",)),
     )
