@@ -380,10 +380,8 @@ class PolicyLearning(Benchmark):
                 others = [level for level in data.levels(task, spec.VISIBLE) if level not in spec.MAZE_TRAINED_LEVELS]
                 settings, sets = [spec.VISIBLE], [(level,) for level in (*spec.MAZE_TRAINED_LEVELS, *others)]
             else:
-                settings, sets = (
-                    list(dict.fromkeys([*spec.DISTRACTOR_KINDS, *data.settings(task)])),
-                    list(self.level_sets),
-                )
+                settings = list(dict.fromkeys([*spec.DISTRACTOR_KINDS, *data.settings(task)]))
+                sets = list(self.level_sets)
             for levels in sets:
                 found = {setting: data.parts(task, levels, setting) for setting in settings}
                 there = [(setting, parts) for setting, parts in found.items() if parts]
