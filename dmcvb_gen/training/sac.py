@@ -114,6 +114,8 @@ class Settings(ReplaySettings):
     bfloat16: bool = False
 
 
+HEARD_WITH = dict.fromkeys(("final_entropy_scale", "final_learning_rate"), "anneal_after") | {"n_step_half_life": "n_step"}
+"""Setting -> the one without which it has no effect."""
 RETURN_LIMIT = 5.0
 """Scaled discounted returns stay within this: the largest seen is scaled to it if the spread alone does not."""
 BINS = 101
@@ -606,6 +608,9 @@ def check(run: Run) -> None:
             f"{steps} steps are all warm-up ({settings.warmup_steps} steps), nothing would be learned; give more "
             "--steps (or buffer_size), or less warm-up: --set warmup_steps=N"
         )
+    for name, needed in HEARD_WITH.items():
+        if name in run.config.settings and getattr(settings, needed, 1) in (0, 1) and not run.begun:
+            raise DmcvbError(f"setting {name} has no effect, as {needed} is {getattr(settings, needed)}; set it too")
     if run.config.init_from and not run.begun:
         start_from(run.algorithm.LEARNER(run.header, settings, run.config.seed), run)
 
