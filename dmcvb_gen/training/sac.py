@@ -114,7 +114,11 @@ class Settings(ReplaySettings):
     bfloat16: bool = False
 
 
-HEARD_WITH = dict.fromkeys(("final_entropy_scale", "final_learning_rate"), "anneal_after") | {"n_step_half_life": "n_step"}
+HEARD_WITH = {
+    "final_entropy_scale": "anneal_after",
+    "final_learning_rate": "anneal_after",
+    "n_step_half_life": "n_step",
+}
 """Setting -> the one without which it has no effect."""
 RETURN_LIMIT = 5.0
 """Scaled discounted returns stay within this: the largest seen is scaled to it if the spread alone does not."""
