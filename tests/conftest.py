@@ -152,6 +152,9 @@ def told(*words, code=0):
     return json.loads(invoke(*words, "--json", code=code).stdout, parse_constant=pytest.fail)
 
 
+MAIN = "from dmcvb_gen.cli import main; main(prog_name='dmcvb-gen')"  # a command, for `python`
+
+
 def python(source, *words, code=0, **options):
     """Run Python code in a process of its own, and give what it ended with; `code` is its exit code."""
     command = [sys.executable, "-c", source, *map(str, words)]

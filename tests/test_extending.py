@@ -6,7 +6,6 @@ import importlib
 import json
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import pytest
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.registry import Registry
-from tests.conftest import invoke, run
+from tests.conftest import MAIN, invoke, python, run
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples" / "extending"
 SHORT = ["--level", "random", "--episodes", "2", "--max-steps", "3", "--size", "16", "--workers", "1"]
@@ -71,10 +70,8 @@ def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family,
     """Its file is named in the environment, so the processes that train it import it, too."""
     agents = ["linear-bc", "state-linear-bc", "id+linear-bc:power=1"]
     words = ["--profile", "smoke", "--workers", "2", "--out", tmp_path, "--agents", ",".join(agents), "--only", only]
-    command = [sys.executable, "-m", "dmcvb_gen", "validate", request.getfixturevalue(family), *words]
     environment = os.environ | {"DMCVB_GEN_PLUGINS": "agent", "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(command, cwd=EXAMPLES, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python(MAIN, "validate", request.getfixturevalue(family), *words, cwd=EXAMPLES, env=environment)
     report = json.loads((tmp_path / "report.json").read_text())
     assert {result["cell"]["agent"] for result in report["results"]} == set(agents) and not report["failed"]
     assert all(result["curve"][-1]["loss"] > 0 for result in report["results"])

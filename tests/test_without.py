@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.conftest import python
+from tests.conftest import MAIN, python
 
-MAIN = "from dmcvb_gen.cli import main; main(sys.argv[1:], prog_name='dmcvb-gen')"
 LABMAZE = f"import sys; sys.modules['labmaze'] = None; {MAIN}"
 UNIX = """
 import sys

@@ -42,6 +42,7 @@ from dmcvb_gen.benchmarks.plan import BUDGETS
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.tasks import ACTION_REPEAT
 from tests import independent_td3_bc
+from tests.agents.test_agents_data import make_data
 
 SIZE, CHANNELS, ACTIONS, STATES = 16, 9, 6, 24
 SIZES, STATE_SIZES = Sizes(STATES, ACTIONS, CHANNELS, SIZE, 3), Sizes(STATES, ACTIONS)
@@ -80,10 +81,6 @@ def moved(learner, *batches):
     for batch in batches:
         learner.update(batch)
     return {name for name, value in learner.named_parameters() if not torch.equal(before[name], value)}
-
-
-def names(learner, *prefixes):
-    return {name for name, _ in learner.named_parameters() if name.startswith(prefixes)}
 
 
 # -- sizes ----------------------------------------------------------------------------------------
@@ -145,16 +142,7 @@ def activations(module):
     return tuple(found) if isinstance(layers[-1], kinds) else (*found, "")
 
 
-def rows_of(name, module, kind, outputs):
-    """Rows of an MLP of the paper's: two hidden layers of 256 with ReLU, and what it ends with."""
-    ends = ("relu", "relu", kind)
-    return {
-        (name, "hidden layers, output"): ((256, 256, outputs), widths(module)),
-        (name, "activations"): (ends, activations(module)),
-    }
-
-
-def papers_table():
+def test_the_papers_table_of_hyperparameters_holds_row_by_row():
     """Module, hyperparameter -> (the paper's value, ours), appendix "Architecture and hyperparameters".
 
     Left out is "Actor, Critic 1 and Critic 2: output dimension 64": an actor gives an action, a critic one value.
@@ -200,11 +188,9 @@ def papers_table():
         ),
     }  # fmt: skip
     for name, module in (("body", td3.net.body), ("actor", td3.net.actor_trunk), ("critic", td3.net.critic_trunk)):
-        rows["TD3-BC", f"the actor's loss moves the {name}"] = (
-            True,
-            {id(p) for p in module.parameters()} <= moved_by_actor,
-        )
-    for name, module, kind, outputs in (
+        moves = {id(p) for p in module.parameters()} <= moved_by_actor
+        rows["TD3-BC", f"the actor's loss moves the {name}"] = (True, moves)
+    for name, module, kind, outputs in (  # MLPs: two hidden layers of 256 with ReLU, and what they end with
         ("ID action predictor", identify.f, "tanh", ACTIONS),
         ("BC action predictor", bc.policy, "tanh", ACTIONS),
         ("LFD predictor", forward.g, "tanh", 64),
@@ -214,13 +200,9 @@ def papers_table():
         ("Critic 1", td3.net.critic1, "tanh", 1),
         ("Critic 2", td3.net.critic2, "tanh", 1),
     ):
-        rows |= rows_of(name, module, kind, outputs)
-    return rows
-
-
-def test_the_papers_table_of_hyperparameters_holds_row_by_row():
-    wrong = {row: values for row, values in papers_table().items() if values[0] != values[1]}
-    assert not wrong
+        rows[name, "hidden layers, output"] = (256, 256, outputs), widths(module)
+        rows[name, "activations"] = ("relu", "relu", kind), activations(module)
+    assert {row: values for row, values in rows.items() if values[0] != values[1]} == {}
 
 
 def test_frame_differences_are_those_of_the_pictures():
@@ -235,8 +217,6 @@ def test_frame_differences_are_those_of_the_pictures():
 
 @pytest.mark.parametrize("frozen", ["bc", "td3-bc"])
 def test_latents_that_were_encoded_once_teach_the_same_as_pictures(frozen):
-    from tests.agents.test_agents_data import make_data
-
     data, policies = make_data(), []
     for encoded in (False, True):
         torch.manual_seed(0)
@@ -296,7 +276,8 @@ def batch_of(kind):
 def test_one_update_moves_exactly_the_parameters_that_the_paper_says(kind):
     make, prefixes, _, _ = KINDS[kind]
     learner = make()
-    assert moved(learner, batch_of(kind)) == names(learner, *prefixes)
+    named = {name for name, _ in learner.named_parameters() if name.startswith(prefixes)}
+    assert moved(learner, batch_of(kind)) == named
 
 
 @pytest.mark.slow_cases("ae", "lapo", "td3-bc")
@@ -416,14 +397,11 @@ def test_td3_bc_makes_the_steps_of_an_independent_one(monkeypatch):
     torch.manual_seed(0)
     learner = TD3BC(None, STATE_SIZES)
     weights = {name: value.detach().clone() for name, value in learner.net.named_parameters()}
-    batches = [make_batch(16, seed) for seed in range(8)]
-    over = torch.arange(16) % 3 == 0  # episodes that ended there
-    changed = dict(discount=(~over).float())
-    batches = [
-        dataclasses.replace(b, observation=b.state, next_observation=b.state.flip(0), **changed) for b in batches
-    ]
-    noises = [torch.randn(16, ACTIONS, generator=torch.Generator().manual_seed(i)) for i in range(8)]
-    drawn = iter(noises)
+    batches, goes_on = [], (torch.arange(16) % 3 != 0).float()  # else the episode ended there
+    for seed in range(8):
+        b = make_batch(16, seed)
+        batches.append(dataclasses.replace(b, observation=b.state, next_observation=b.state.flip(0), discount=goes_on))
+    drawn = iter(noises := gradients((16, ACTIONS), 8))
     monkeypatch.setattr(torch, "randn_like", lambda like: next(drawn))
     for batch in batches:
         learner.update(batch)
@@ -519,8 +497,6 @@ def test_a_file_that_is_no_dino_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", [name for name in agent_names() if not name.startswith("dino")])
 def test_every_agent_can_be_made_and_acts(name):
-    from tests.agents.test_agents_data import make_data
-
     agent, data = parse_agent(name), make_data()
     assert agent.name == name
     data = data.but(frames=None) if agent.sees_state else data
@@ -548,16 +524,13 @@ def descend(optimizer: torch.optim.Optimizer, weight: nn.Parameter, steps: list[
     return weight.detach()
 
 
-def torchs_muon(weight: nn.Parameter) -> torch.optim.Muon:
-    return torch.optim.Muon([weight], lr=0.01, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
-
-
 @pytest.mark.parametrize("shape", [(48, 96), (96, 48), (64, 64)])
 def test_matrices_move_as_by_torchs_muon(shape):
     start, steps = torch.randn(shape, generator=torch.Generator().manual_seed(0)), gradients(shape)
     ours, theirs = nn.Parameter(start.clone()), nn.Parameter(start.clone())
     half = descend(Muon([ours], 0.01, torch.bfloat16), ours, steps)
-    expected = descend(torchs_muon(theirs), theirs, steps)
+    torchs = torch.optim.Muon([theirs], lr=0.01, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+    expected = descend(torchs, theirs, steps)
     moved = (expected - start).norm()
     assert (half - expected).norm() < 0.01 * moved
     exact = nn.Parameter(start.clone())

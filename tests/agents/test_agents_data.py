@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -182,25 +183,18 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
 
 def test_the_disk_is_asked_for_every_frame_of_a_batch_and_for_little_more(small_release, tmp_path, monkeypatch):
     data = load_data(Release.open(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
-    asked: list[tuple[int, int]] = []
-    advise = agents_data._advise
-
-    def recorded(file, use, start, stop):
-        asked.append((start, stop))
-        advise(file, use, start, stop)
-
-    monkeypatch.setattr(agents_data, "_advise", recorded)
+    advise = Mock(wraps=agents_data._advise)
+    monkeypatch.setattr(agents_data, "_advise", advise)
     rows, frame = torch.tensor([0, 1, 7, 501, 500, len(data.state) - 1]), data.frames.table[0].numel()
     data.observe(rows)
     first = [0, 0, 5, 501, 498, len(data.state) - 3]  # an episode's first frames have none before them
+    asked = [call.args[2:] for call in advise.call_args_list]
     assert asked == [(one * frame, (int(row) + 1) * frame) for one, row in zip(first, rows, strict=True)]
 
 
 @pytest.mark.parametrize("free", [1000, 10**12])  # more, and then another process takes it
 def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tmp_path, monkeypatch, free):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     monkeypatch.setattr(steps_module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
     monkeypatch.setattr(steps_module.os, "posix_fallocate", full)
     with pytest.raises(DmcvbError, match="fit neither into memory nor into .* another --out, or more --memory"):

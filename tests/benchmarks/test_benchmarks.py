@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -216,19 +217,8 @@ class Recorder:
         self.seen.append(observation.clone())
         return torch.full((len(observation), self.size), 0.1)
 
-    def trained(self, name="bc", normalization=None):
-        return TrainedAgent(parse_agent(name), None, self, normalization)
-
-
-def rewards_by_hand(evaluator, actions, steps):
-    batch = evaluator.task.batch(evaluator.episodes)
-    state = batch.reset(evaluator.streams("initial_state"))
-    total, states = 0, [state]
-    for _ in range(steps):
-        result = batch.step(np.full((evaluator.episodes, actions), 0.1))
-        total = total + result.reward
-        states.append(result.state)
-    return total, states
+    def trained(self, normalization):
+        return TrainedAgent(parse_agent("state-bc"), None, self, normalization)
 
 
 def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
@@ -236,8 +226,13 @@ def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
     normalization = Normalization(torch.full((24,), 0.5), torch.full((24,), 2.0))
     evaluator = Evaluator(subset, pixels=False, episodes=3, max_steps=6)
     policy = Recorder(6)
-    score = evaluator.score(policy.trained("state-bc", normalization))
-    returns, states = rewards_by_hand(evaluator, 6, 6)
+    score = evaluator.score(policy.trained(normalization))
+    batch, returns = evaluator.task.batch(3), np.zeros(3)
+    states = [batch.reset(evaluator.streams("initial_state"))]
+    for _ in range(6):
+        result = batch.step(np.full((3, 6), 0.1))
+        returns += result.reward
+        states.append(result.state)
     np.testing.assert_allclose(score.returns, returns, rtol=1e-6)
     assert score.mean == pytest.approx(returns.mean())
     assert score.stderr == pytest.approx(returns.std(ddof=1) / np.sqrt(3))
@@ -274,7 +269,7 @@ def test_mazes_are_scored_by_success_and_start_where_the_pair_says():
     normalization = Normalization(torch.zeros(task.state_size), torch.ones(task.state_size))
     evaluator = Evaluator(subset, pixels=False, episodes=2, max_steps=3, pair=((1, 1), (5, 5)))
     policy = Recorder(8)
-    score = evaluator.score(policy.trained("state-bc", normalization))
+    score = evaluator.score(policy.trained(normalization))
     assert score.success == 0.0 and score.speed is None and score.mean < 0
     place = policy.seen[0][:, task.state_slices["walker_position"]]
     start = torch.as_tensor(task.layout.world((1, 1)), dtype=place.dtype)
@@ -435,33 +430,17 @@ def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(who
 def test_any_error_of_a_cell_is_its_own_with_its_traceback_in_a_log(small_release, tmp_path, monkeypatch):
     release, budget = Release.open(small_release), dataclasses.replace(SMOKE, seed=7)  # data that are not loaded yet
     cells = [c for c in plan_benchmark("b1", release, ["dino+bc", "state-bc"])[0] if c.setting == "none"]
-
-    def out_of_memory(*_, **__):
-        raise MemoryError("no room for 7 GB")
-
-    def out_of_space(*_):
-        raise OSError("no space left")
-
-    monkeypatch.setattr(cells_module, "load_data", out_of_memory)
+    monkeypatch.setattr(cells_module, "load_data", Mock(side_effect=MemoryError("no room for 7 GB")))
     results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, budget, cells)}
     log = tmp_path / "cells" / f"{cells[1].id}.log"
     assert results["state-bc"]["error"] == f"MemoryError: no room for 7 GB (all of it in {log})"
-    assert "out_of_memory" in log.read_text() and "--dino-weights" in results["dino+bc"]["error"]
-    monkeypatch.setattr(cells_module, "write_text", out_of_space)
+    assert " load_data(" in log.read_text() and "--dino-weights" in results["dino+bc"]["error"]
+    monkeypatch.setattr(cells_module, "write_text", Mock(side_effect=OSError("no space left")))
     results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, budget, cells)}
     assert results["state-bc"]["error"].startswith("MemoryError")
     monkeypatch.undo()
     results = {cell.agent.name: result for cell, result in run_cells(small_release, tmp_path, budget, cells)}
     assert results["state-bc"]["score"]["mean"] >= 0 and not log.exists()
-
-
-def compared(task, pairs, benchmark="b1", setting="x"):
-    """What `compare` says of agents' mean scores."""
-    part = (Slice(f"{task}/expert/{setting}"),)
-    results = [
-        (Cell(benchmark, task, setting, parse_agent(name), part), {"score": {"mean": mean}}) for name, mean in pairs
-    ]
-    return {cell.agent.name: compare(cell, results) for cell, _ in results}
 
 
 @pytest.mark.parametrize("benchmark, task, setting, reference, agent, share, difference, words", [
@@ -474,8 +453,10 @@ def compared(task, pairs, benchmark="b1", setting="x"):
 def test_a_score_is_a_share_of_its_reference_or_a_difference_if_returns_are_negative(
     benchmark, task, setting, reference, agent, share, difference, words
 ):
-    found = compared(task, [reference, agent], benchmark, setting)[agent[0]]
-    assert found == {"share": share, "difference": difference, "reference": words}
+    results, part = [], (Slice(f"{task}/expert/{setting}"),)
+    for name, mean in (reference, agent):
+        results.append((Cell(benchmark, task, setting, parse_agent(name), part), {"score": {"mean": mean}}))
+    assert compare(results[1][0], results) == {"share": share, "difference": difference, "reference": words}
 
 
 def test_data_that_grew_or_look_otherwise_are_read_again(small_release, tmp_path):

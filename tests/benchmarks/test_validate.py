@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import json
 import re
@@ -46,6 +45,7 @@ from dmcvb_gen.generate.references import reference_returns
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
 from tests.conftest import TINY_MAZE, invoke, maze_recipe, rewrite, roll_out, short_recipe, small_recipe
+from tests.release.test_verify import put
 
 NAME = "walker-walk/expert/dynamic"
 
@@ -60,17 +60,7 @@ def release(tmp_path_factory):
 
 @pytest.fixture
 def copy(release, tmp_path):
-    shutil.copytree(release, tmp_path / "copy")
-    return tmp_path / "copy"
-
-
-def set_rows(array, episode, step, value):
-    def change(group):
-        rows = group[array][episode]
-        rows[step] = value
-        group[array][episode] = rows
-
-    return change
+    return shutil.copytree(release, tmp_path / "copy")
 
 
 @pytest.mark.slow_cases("small_mazes", "small_release")
@@ -166,7 +156,7 @@ def test_its_tables_have_the_numbers_of_its_facts(report):
 def test_every_group_of_cells_has_a_figure_with_its_data_if_they_are_alike(release):
     cell = plan_benchmark("b1", Release.open(release), ["bc"])[0][0]
     point = {"step": 1, "loss": 1.0, "score": {"mean": 1.0, "stderr": 0.1}}
-    cells = [dataclasses.replace(cell, setting=f"setting{number}") for number in range(3)]
+    cells = [replace(cell, setting=f"setting{number}") for number in range(3)]
     data = {"mean": 1.0, "limit": 500}
     results = [
         (cell, {"curve": [point], "data": data, "score": {"limit": 500 + number}}) for number, cell in enumerate(cells)
@@ -277,7 +267,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
 
 @pytest.mark.slow
 def test_a_damaged_release_ends_with_1_names_the_place_and_is_not_trained_on(copy, tmp_path):
-    rewrite(copy, NAME, set_rows("state", 1, (123, 4), np.nan))
+    rewrite(copy, NAME, put("state", (1, 123, 4), np.nan))
     result = invoke("validate", copy, "--agents", "state-bc", "--out", tmp_path / "out", code=1)
     assert f"FAIL finite: {NAME}, episode 1, step 123" in result.output
     page = (tmp_path / "out" / "report.html").read_text()
@@ -303,8 +293,7 @@ def test_a_full_disk_is_told_in_a_line(name, words, release, tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_a_release_that_is_not_whole_is_called_so(small_release, tmp_path):
-    part = tmp_path / "part"
-    shutil.copytree(small_release, part)
+    part = shutil.copytree(small_release, tmp_path / "part")
     (part / record_path("walker-walk/random/none/labels", 1)).unlink()
     shutil.rmtree(part / "records" / "walker-walk" / "random" / "dynamic")
     for path in [part / "manifest.json", *part.rglob("zarr.json")]:
@@ -423,7 +412,7 @@ def test_an_evaluation_unlike_the_policys_data_is_refused_or_said(walkers, caplo
     Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(tmp_path / "clips" / "val" / "one" / "0.png")
     dmcvb_gen.evaluate(agent, "walker-walk/dynamic", backgrounds=str(tmp_path / "clips"), **options)
     drawn = {"renderer": {"name": "opengl", "samples": 4}}
-    elsewhere = dataclasses.replace(agent, evaluation=agent.evaluation | drawn)
+    elsewhere = replace(agent, evaluation=agent.evaluation | drawn)
     dmcvb_gen.evaluate(elsewhere, "walker-walk/dynamic", renderer="native", **options)
     videos, renderer = caplog.messages
     assert "has backgrounds" in videos and "has renderer" in renderer and "opengl" in renderer
@@ -454,7 +443,7 @@ def test_returns_that_cannot_be_read_cost_no_report(small_mazes, tmp_path):
 
 
 def test_black_pictures_fail_with_their_step_and_frozen_ones_are_a_warning(copy):
-    rewrite(copy, NAME, set_rows("pixels", 1, 77, 0))
+    rewrite(copy, NAME, put("pixels", (1, 77), 0))
     findings = check_structure(Release.open(copy)).findings
     assert ("pictures", 1, 77) in {(one.check, one.episode, one.step) for one in findings}
     rewrite(copy, NAME, lambda group: group["pixels"].__setitem__(1, np.repeat(group["pixels"][1][:1], 501, axis=0)))
@@ -491,9 +480,9 @@ def test_data_that_show_what_evaluation_shows_are_warned_of(tmp_path, small_rele
         assert not seen_in(release, plan_benchmark("b1", release, ["bc"])[0])
 
 
-def with_policy(subset, **evaluation):
+def with_policy(subset, task="walker-walk", **evaluation):
     policy = subset.record.policies[0]
-    header = policy.header | {"evaluation": policy.header["evaluation"] | evaluation}
+    header = policy.header | {"task": task, "evaluation": policy.header["evaluation"] | evaluation}
     policies = (policy.model_copy(update={"header": header}),)
     subset.record = subset.record.model_copy(update={"policies": policies})
     return subset
@@ -505,10 +494,7 @@ def test_returns_unlike_the_policys_own_fail(release):
     [finding] = check_policy_returns(with_policy(subset, mean=5000.0, std=5.0, mode="mean"))
     assert finding.check == "returns" and "its file says 5000.0" in finding.message
     assert not list(check_policy_returns(with_policy(subset, mode="sampled")))  # not comparable
-    elsewhere = with_policy(subset, mode="mean")
-    [policy] = elsewhere.record.policies
-    policies = (policy.model_copy(update={"header": policy.header | {"task": "cheetah-run"}}),)
-    elsewhere.record = elsewhere.record.model_copy(update={"policies": policies})
+    elsewhere = with_policy(subset, "cheetah-run", mode="mean")
     assert not list(check_policy_returns(elsewhere))  # an ant's policy walks in mazes that it was not measured in
 
 

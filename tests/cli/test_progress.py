@@ -9,8 +9,7 @@ from dmcvb_gen import progress
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, start
-from dmcvb_gen.generate.recipe import make_recipe
-from tests.conftest import invoke, run
+from tests.conftest import invoke, run, small_recipe
 
 LINE = re.compile(r"^(.+: )? *\d+%\| (?P<done>\S+)/(?P<all>\S+) \[[\d:]+<[\d:?]+, .+/ ?\S+(, .+)?\]$")
 TASKS = ("walker-walk", "ant-maze-empty7x7")
@@ -66,9 +65,8 @@ def test_images_and_scores_are_told_while_cells_train(tmp_path, monkeypatch, tas
 def test_episodes_that_end_early_are_expected_to_go_on_doing_so(tmp_path):
     """Experts are at the goal long before the time limit."""
     told = Mock()
-    fields = {"episodes": 3, "episodes_per_shard": 1}
-    pattern = fields | {"tasks": "ant-maze-empty7x7", "levels": "expert", "settings": "visible"}
-    plan = make_plan(make_recipe({"name": "early", "size": 16, "subsets": [pattern]}), tmp_path / "early")
+    recipe = small_recipe(tasks="ant-maze-empty7x7", levels="expert", settings="visible", episodes_per_shard=1)
+    plan = make_plan(recipe, tmp_path / "early")
     start(plan)
     list(run_works(plan.works, 1, told))
     subset = Release.open(tmp_path / "early")["ant-maze-empty7x7/expert/visible"]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,20 +11,18 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate import resolve
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, run_plan, start
-from dmcvb_gen.generate.recipe import make_recipe
 from dmcvb_gen.parallel import Ray
-from tests.conftest import invoke, roll_out, run, told
+from tests.conftest import MAIN, invoke, python, roll_out, run, small_recipe, told
 from tests.dataset.oracle import contents
 
 WALKER = {"tasks": "walker-walk", "levels": "expert", "settings": ["none", "dynamic"], "episodes": 4}
 MAZE = {"tasks": "ant-maze-empty7x7", "levels": "expert", "settings": "hidden", "episodes": 4}
 
 
-def quick_recipe(*patterns, **changes):
+def quick_recipe():
     """Five-step episodes in shards of one, small images."""
-    short = [pattern | {"episodes_per_shard": 1, "max_steps": 5} for pattern in patterns or (WALKER, MAZE)]
-    fields = {"name": "quick", "seed": 2, "size": 8, "renderer": {"backend": "native"}, "subsets": short}
-    return make_recipe(fields | changes)
+    short = [pattern | {"episodes_per_shard": 1, "max_steps": 5} for pattern in (WALKER, MAZE)]
+    return small_recipe(name="quick", seed=2, size=8, subsets=short)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +105,5 @@ def test_a_ray_cluster_makes_the_same_release_and_lets_own_tasks_run(whole, tmp_
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     words = "tests.tasks.hostile_tasks:plain --level random --episodes 2 --max-steps 3 --size 8 --out own --workers ray"
-    command = [sys.executable, "-m", "dmcvb_gen", "rollout", *words.split()]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python(MAIN, "rollout", *words.split())
     assert len(Release.open(tmp_path / "own")) == 1

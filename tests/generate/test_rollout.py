@@ -29,7 +29,7 @@ from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.spec import LEVELS, is_maze
 from dmcvb_gen.tasks import get_task
-from tests.conftest import invoke, maze_recipe, records, roll_out, short_recipe, small_recipe
+from tests.conftest import MAIN, invoke, maze_recipe, python, records, roll_out, short_recipe, small_recipe
 from tests.faults.commands import GRACE, session
 from tests.faults.inject import files_up_to
 
@@ -96,27 +96,21 @@ def test_an_episode_depends_on_its_index_alone():
     assert (other.action != alone.action).any() and other.seed != alone.seed
 
 
-COMMAND = [sys.executable, "-m", "dmcvb_gen", "rollout", "walker-walk", "--level", "random", "--distractor", "none"]
-COMMAND += ["--distractor", "dynamic", "--episodes", "5", "--episodes-per-shard", "1", "--size", "16"]
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(unavailable() is not None, reason=f"OpenGL: {unavailable()}")
 def test_opengl_in_this_process_ends_without_a_word_of_its_own(tmp_path):
-    options = ["--renderer", "opengl", "--episodes", "1", "--max-steps", "2", "--size", "16", "--workers", "1"]
-    done = subprocess.run([*COMMAND, *options, "--out", str(tmp_path / "r")], capture_output=True, text=True)
-    assert done.returncode == 0 and "Traceback" not in done.stderr and "Exception" not in done.stderr, done.stderr
+    words = ["--level", "random", "--distractor", "dynamic", "--episodes", 1, "--max-steps", 2, "--size", 16]
+    words += ["--renderer", "opengl", "--workers", 1, "--out", tmp_path / "r"]
+    done = python(MAIN, "rollout", "walker-walk", *words)
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr, done.stderr
 
 
 @pytest.mark.slow
 def test_ctrl_c_ends_cleanly_leaves_no_process_and_says_how_to_go_on(tmp_path):
-    process = subprocess.Popen(
-        [*COMMAND, "--episodes", "40", "--out", str(tmp_path / "r"), "--workers", "2"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    command = [sys.executable, "-m", "dmcvb_gen", "rollout", "walker-walk", "--level", "random", "--size", "16"]
+    command += ["--distractor", "dynamic", "--episodes", "40", "--episodes-per-shard", "1", "--workers", "2"]
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*command, "--out", tmp_path / "r"], **pipes, start_new_session=True)
     deadline = time.time() + 120
     while not list((tmp_path / "r").glob("records/**/labels/*.json")) and time.time() < deadline:
         time.sleep(0.05)
@@ -277,10 +271,8 @@ def test_a_recipe_takes_other_values_and_none_is_dropped():
 def test_a_release_has_its_own_copies_of_policies_and_videos_and_no_place_of_this_machine(tmp_path):
     shutil.copytree(builtin_folder(), tmp_path / "mine/videos")
     shutil.copy(bundled_policies("walker-walk", "expert")[0], tmp_path / "mine/own.safetensors")
-    mine = {
-        "backgrounds": str(tmp_path / "mine/videos"),
-        "policies": {"expert": str(tmp_path / "mine/own.safetensors")},
-    }
+    mine = {"backgrounds": str(tmp_path / "mine/videos")}
+    mine |= {"policies": {"expert": str(tmp_path / "mine/own.safetensors")}}
     recipe = short_recipe(levels="expert", settings="dynamic", episodes=1, max_steps=3, size=8, **mine)
     release = roll_out(recipe, tmp_path / "r")
     shutil.rmtree(tmp_path / "mine")

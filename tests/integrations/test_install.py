@@ -18,7 +18,7 @@ from packaging.version import Version
 
 from dmcvb_gen.cli import main
 from dmcvb_gen.extras import EXTRAS
-from tests.conftest import python
+from tests.conftest import MAIN, python
 
 ROOT = Path(__file__).parents[2]
 READING = ("numpy", "zarr", "numcodecs", "fsspec", "pydantic", "click", "rich", "tqdm", "filelock", "tenacity", "h5py")
@@ -82,10 +82,7 @@ def site_of(packages, wheel, folder):
 
 def run(site, *arguments):
     """`python -m dmcvb_gen ...` with the packages of `site` alone."""
-    code = (
-        f"import sys; sys.path = [p for p in sys.path if 'site-packages' not in p]; sys.path.insert(0, {str(site)!r})"
-    )
-    code += "; sys.argv[0] = 'dmcvb-gen'; from dmcvb_gen.cli import main; main(prog_name='dmcvb-gen')"
+    code = f"import sys; sys.path = [{str(site)!r}, *(p for p in sys.path if 'site-packages' not in p)]; {MAIN}"
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     command = [sys.executable, "-S", "-c", code, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=site.parent)
@@ -121,8 +118,7 @@ class Missing:
             raise ModuleNotFoundError(name, name=name)
 
 sys.meta_path.insert(0, Missing())
-from dmcvb_gen.cli import main
-main(sys.argv[1:], prog_name="dmcvb-gen")
+{MAIN}
 """
 
     def command(*words, code=0):

@@ -24,9 +24,7 @@ def datasets(stored, tmp_path_factory):
         export(str(one.folder), "minari", root, [one.name])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(root))
-        yield {
-            name: f"dmcvb_gen/{name.rsplit('/', 1)[0]}-{one.name.rsplit('/', 1)[1]}-v0" for name, one in stored.items()
-        }
+        yield {name: "dmcvb_gen/{}-{}-v0".format(*name.rsplit("/", 1)) for name in stored}
 
 
 def test_minari_lists_what_was_exported(datasets):

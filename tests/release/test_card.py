@@ -28,16 +28,14 @@ from tests.fake_hub import content
 
 @pytest.fixture(scope="module")
 def carded(small_release, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("card") / "small"
-    shutil.copytree(small_release, folder)
+    folder = shutil.copytree(small_release, tmp_path_factory.mktemp("card") / "small")
     write_card(folder)
     return folder
 
 
 @pytest.fixture
 def copy(carded, tmp_path):
-    shutil.copytree(carded, tmp_path / "copy")
-    return tmp_path / "copy"
+    return shutil.copytree(carded, tmp_path / "copy")
 
 
 def test_the_header_is_what_hugging_face_reads(carded):

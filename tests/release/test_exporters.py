@@ -35,8 +35,7 @@ VIEWS = ("top", "egocentric", "follow", "overhead")
 def in_order(names):
     """Names of images in the order of their views; the one name of a task with one view."""
     names = list(names)
-    ordered = [name for view in VIEWS for name in names if view in name]
-    return ordered or names
+    return [name for view in VIEWS for name in names if view in name] or names
 
 
 def stacked(images):

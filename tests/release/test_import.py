@@ -94,7 +94,6 @@ def test_damaged_or_foreign_folders_are_not_imported(rlds, tmp_path):
     (tmp_path / "odd/features.json").write_text(json.dumps(tree))
     with pytest.raises(StoreError, match="features.json does not describe RLDS steps"):
         import_tfds(tmp_path / "odd", tmp_path / "r", task="walker-walk", level="expert", setting="none")
-    shutil.rmtree(tmp_path / "odd")
     shutil.copytree(rlds, tmp_path / "somewhere")
     with pytest.raises(StoreError, match="task, level"):
         import_tfds(tmp_path / "somewhere", tmp_path / "r")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -95,10 +96,8 @@ def test_returns_of_longer_episodes_may_be_higher(tmp_path):
 
 
 def test_what_this_machine_cannot_check_is_not_called_damaged(copy, monkeypatch):
-    def fail(*_, **__):
-        raise RenderingError("no renderer here")
-
-    monkeypatch.setattr("dmcvb_gen.release.contents.renderer_for", fail)
+    error = RenderingError("no renderer here")
+    monkeypatch.setattr("dmcvb_gen.release.contents.renderer_for", Mock(side_effect=error))
     said = invoke("verify", copy, code=3).output
     assert "NOT CHECKED walker-walk" in said and "regenerate" not in said
 

@@ -14,6 +14,7 @@ import tracemalloc
 import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import zarr
@@ -260,12 +261,9 @@ class TestFolder(StoreTests):
         assert [(file.name, file.read_bytes()) for file in outside.iterdir()] == [("b", b"secret")]
 
     def test_no_room_leaves_what_was_there(self, store, monkeypatch):
-        def full(handle):
-            raise OSError(28, "No space left on device")
-
         store.create("a", b"1")
         with monkeypatch.context() as patch:
-            patch.setattr("os.fsync", full)
+            patch.setattr("os.fsync", Mock(side_effect=OSError(28, "No space left on device")))
             for write in (lambda: store.replace("a", b"2"), lambda: store.create("b", b"2")):
                 with pytest.raises(StoreError, match="no room to write to .*make room"):
                     write()
@@ -288,10 +286,7 @@ class TestFolderWithoutLinks(StoreTests):
 
     @pytest.fixture
     def store(self, tmp_path, monkeypatch):
-        def no_link(*_, **__):
-            raise PermissionError(1, "Operation not permitted")
-
-        monkeypatch.setattr("os.link", no_link)
+        monkeypatch.setattr("os.link", Mock(side_effect=PermissionError(1, "Operation not permitted")))
         store = open_store(f"file://{tmp_path}/r")
         yield store
         assert not store.list() or (store.folder / ".lock").exists()  # else links were made all the same

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-import subprocess
-import sys
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -13,6 +12,7 @@ from torch._dynamo.exc import BackendCompilerFailed
 
 from dmcvb_gen import compilation
 from dmcvb_gen.compilation import compiled, compiler
+from tests.conftest import MAIN, python
 
 LINE = "Training runs without torch.compile, which is slower"
 SETTINGS = ("warmup_steps=8", "simulations=4", "batch_size=8", "actor_hidden=[8]", "critic_hidden=[8]")
@@ -32,21 +32,12 @@ def test_functions_stay_as_they_are_without_a_compiler(monkeypatch, caplog):
     assert [record.message for record in caplog.records] == [f"{LINE}: there is no C++ compiler."]
 
 
-def failing(error):
-    def make(function):
-        def call(*arguments):
-            raise error
-
-        return call
-
-    return make
-
-
 def test_what_cannot_be_compiled_is_called_as_it_is(monkeypatch, caplog):
     def backend(): ...
 
     monkeypatch.setattr(compilation, "compiler", lambda: "/usr/bin/g++")
-    monkeypatch.setattr(torch, "compile", failing(BackendCompilerFailed(backend, RuntimeError("no headers"), None)))
+    error = BackendCompilerFailed(backend, RuntimeError("no headers"), None)
+    monkeypatch.setattr(torch, "compile", lambda function: Mock(side_effect=error))
     with caplog.at_level(logging.WARNING):
         function = compiled(lambda x: x + 1)
         assert function(1) == 2 and function(2) == 3
@@ -56,7 +47,7 @@ def test_what_cannot_be_compiled_is_called_as_it_is(monkeypatch, caplog):
 
 def test_a_functions_own_errors_are_not_hidden(monkeypatch):
     monkeypatch.setattr(compilation, "compiler", lambda: "/usr/bin/g++")
-    monkeypatch.setattr(torch, "compile", failing(ValueError("its own")))
+    monkeypatch.setattr(torch, "compile", lambda function: Mock(side_effect=ValueError("its own")))
     with pytest.raises(ValueError, match="its own"):
         compiled(lambda x: x)(1)
 
@@ -68,8 +59,6 @@ def test_what_trains_without_a_compiler_says_so_in_one_line_and_trains(command, 
         words = ["validate", small_release, "--compile", "--agents", "state-bc", "--only", "*/*/none", "--workers", 1]
     else:
         words = ["train-behaviour", "walker-walk", "--algo", command, "--steps", 32, *SMALL, "--set", "compile=true"]
-    arguments = [sys.executable, "-m", "dmcvb_gen", *map(str, words), "--out", str(tmp_path / "out")]
-    done = subprocess.run(arguments, capture_output=True, text=True, env=os.environ | {"CXX": "no-such-compiler"})
-    assert done.returncode == 0, done.stderr
+    done = python(MAIN, *words, "--out", tmp_path / "out", env=os.environ | {"CXX": "no-such-compiler"})
     assert done.stderr.count(LINE) == 1 and "Traceback" not in done.stderr
     assert command == "validate" or list((tmp_path / "out" / "checkpoints").glob("*.safetensors"))

@@ -124,38 +124,23 @@ SHORT = "--steps 448 --evaluate-every 64 --set ramp=200 --set simulations=16 --s
 """Enough to find the goal in a hall of two cells now and then."""
 
 
-@pytest.fixture
-def in_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def documented_commands() -> list[list[str]]:
-    """The commands of docs/mazes.md that make a release of ring.txt."""
+@pytest.mark.full
+def test_the_documented_commands_of_ring_txt_take_a_sketch_to_a_verified_release(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "mazes.md").read_text()
     block = next(code for code in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if "train-behaviour ring" in code)
-    return [shlex.split(line)[1:] for line in block.splitlines()]
-
-
-@pytest.fixture
-def quick_selection(monkeypatch):
-    """Convergence, medium to a tenth and 100 episodes a checkpoint take minutes; the commands' way is the same."""
-    select = selection.select_checkpoints
+    commands, select = [shlex.split(line)[1:] for line in block.splitlines()], selection.select_checkpoints
+    assert len(commands) <= 6
+    # Convergence, medium to a tenth and 100 episodes a checkpoint take minutes; the commands' way is the same.
     monkeypatch.setattr(selection, "converge", lambda *curve: selection.Convergence(-80.0, 0.0, True))
     monkeypatch.setattr(selection, "select_checkpoints", lambda folder, progress: select(folder, 5, progress=progress))
     monkeypatch.setattr(selection, "MEDIUM_TOLERANCE", 0.6)
-
-
-@pytest.mark.full
-def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, quick_selection):
-    (in_folder / "ring.txt").write_text(HALL)
-    commands = documented_commands()
-    assert len(commands) <= 6
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ring.txt").write_text(HALL)
     for command in commands:
         short = {"train-behaviour": SHORT, "rollout": "--size 16 --max-steps 50"}.get(command[0], "").split()
         done = invoke(*command, *short, code=0)
         assert "***" not in done.output  # messages have the maze's name, not its rows
-    release = dmcvb_gen.open(str(in_folder / "ring"))
+    release = dmcvb_gen.open(str(tmp_path / "ring"))
     assert sorted(name.split("/")[1] for name in release) == ["expert", "medium"]
     assert [release[name].array("length").shape for name in release] == [(20,), (20,)]
 
@@ -168,8 +153,9 @@ def test_the_documented_commands_take_a_sketch_to_a_verified_release(in_folder, 
         ("****\n*   \n****\n", "hole in its outer wall"),
     ],
 )
-def test_a_maze_that_cannot_be_learned_is_one_line(in_folder, rows, message):
-    (in_folder / "bad.txt").write_text(rows)
+def test_a_maze_that_cannot_be_learned_is_one_line(tmp_path, monkeypatch, rows, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.txt").write_text(rows)
     done = invoke("train-behaviour", "bad.txt", code=2)
     assert re.search(message, done.output) and done.output.count("\n") == 1
     assert not os.path.exists("runs")

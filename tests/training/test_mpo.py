@@ -20,24 +20,14 @@ def gaussian(mean, std):
     return Independent(Normal(mean, std), 1)
 
 
-@pytest.fixture
-def two():
-    """Two Gaussians over three actions for five states, and samples of the first."""
+def test_densities_and_divergences_through_mean_and_deviation_are_those_of_torch():
+    """Of two Gaussians over three actions for five states, and samples of the first."""
     torch.manual_seed(0)
     mean, new = torch.randn(5, 3), torch.randn(5, 3)
     std, other = torch.rand(5, 3) + 0.1, torch.rand(5, 3) + 0.1
-    return mean, std, new, other, gaussian(mean, std).sample((7,))
-
-
-def test_densities_are_a_gaussians(two):
-    mean, std, _, _, sampled = two
-    constant = 1.5 * math.log(2 * math.pi)
-    torch.testing.assert_close(mpo.log_density(sampled, mean, std) - constant, gaussian(mean, std).log_prob(sampled))
-
-
-def test_divergences_through_mean_and_deviation_are_those_of_torch(two):
-    mean, std, new, other, _ = two
-    one = gaussian(mean, std)
+    one, constant = gaussian(mean, std), 1.5 * math.log(2 * math.pi)
+    sampled = one.sample((7,))
+    torch.testing.assert_close(mpo.log_density(sampled, mean, std) - constant, one.log_prob(sampled))
     torch.testing.assert_close(mpo.kl_of_means(mean, new, std), kl_divergence(one, gaussian(new, std)).mean())
     torch.testing.assert_close(mpo.kl_of_stds(std, other), kl_divergence(one, gaussian(mean, other)).mean())
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import io
 import multiprocessing
 import os
 import pathlib
-import resource
 import shutil
 import signal
 
@@ -28,6 +26,7 @@ from dmcvb_gen.training.episodes import standing_states
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.run import LOG, Run, RunConfig, Stopped, check_same, open_run, read_rows
 from dmcvb_gen.training.settings import default_run
+from tests.faults.inject import files_up_to
 
 SAC = dict(warmup_steps=24, batch_size=16, actor_hidden=[16], critic_hidden=[16], compile=False, simulations=4)
 SAC |= dict(train_episode_steps=20)
@@ -175,23 +174,12 @@ def test_ten_kills_at_random_moments_change_nothing(tmp_path, case, steps, every
     assert_same_run(whole, killed)
 
 
-@contextlib.contextmanager
-def largest_file(size):
-    """No file grows beyond `size` bytes, as on a full disk: the write fails with an OSError."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 @pytest.mark.slow
 def test_a_disk_that_fills_up_while_saving_leaves_the_previous_state(tmp_path):
     train(tmp_path / "run", steps=80)
     path = tmp_path / "run" / "resume" / STATE
     before = path.read_bytes()
-    with largest_file(len(before) - 1000), pytest.raises(DmcvbError, match="previous saved state is whole.*--resume"):
+    with files_up_to(len(before) - 1000), pytest.raises(DmcvbError, match="previous saved state is whole.*--resume"):
         train(tmp_path / "run", True)
     assert path.read_bytes() == before and not list((tmp_path / "run").rglob("*.partial"))
     assert_same_run(train(tmp_path / "whole"), train(tmp_path / "run", True))
