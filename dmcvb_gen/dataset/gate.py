@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -361,18 +361,20 @@ class Release:
     @property
     def shortfalls(self) -> dict[str, tuple[int, int]]:
         """Subsets that are not whole here -> (episodes here, episodes that belong to them)."""
-        here = dict.fromkeys(self._planned, 0) | {name: len(subset.episodes) for name, subset in self.subsets.items()}
-        return {name: (count, self._planned[name]) for name, count in here.items() if count < self._planned[name]}
+        return self._fewer_than(self.manifest.subsets)
 
-    @functools.cached_property
-    def _planned(self) -> dict[str, int]:
-        """Episodes of each subset; in the folder where a release is made, as many as its recipes ask for."""
-        planned = {record.name: record.episodes for record in self.manifest.subsets}
-        if self.store.folder and self.copy is None and self.manifest_path == MANIFEST:
-            for recipe in read_recipes(self.store):
-                for record in recipe.subsets:
-                    planned[record.name] = max(record.episodes, planned.get(record.name, 0))
-        return planned
+    @property
+    def unfinished(self) -> dict[str, tuple[int, int]]:
+        """The same of what recipes ask for, in the folder where the release is made."""
+        if not self.store.folder or self.copy or self.manifest_path != MANIFEST:
+            return self.shortfalls
+        return self._fewer_than(record for recipe in read_recipes(self.store) for record in recipe.subsets)
+
+    def _fewer_than(self, asked: Iterable[SubsetRecord]) -> dict[str, tuple[int, int]]:
+        here = {name: len(subset.episodes) for name, subset in self.subsets.items()}
+        asked = sorted(asked, key=lambda record: record.episodes)  # the largest count of a subset comes last
+        pairs = {record.name: (here.get(record.name, 0), record.episodes) for record in asked}
+        return {name: (count, planned) for name, (count, planned) in pairs.items() if count < planned}
 
     @property
     def path(self) -> Path:

@@ -68,7 +68,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
     return dict(
         name=release.manifest.name,
         version=release.manifest.version,
-        complete=not (release.in_the_making or release.shortfalls),
+        complete=not (release.in_the_making or release.unfinished),
         part=bool(release.copy and release.shortfalls),
         digest=release.digest,
         compared=release.compared,
@@ -76,7 +76,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
         steps=sum(subset["steps"] for subset in subsets),
         bytes=sum(file.bytes for shard in release.shards() if shard.here for file in shard.files),
         subsets=subsets,
-        missing={name: planned for name, (here, planned) in release.shortfalls.items() if not here},
+        missing={name: planned for name, (here, planned) in release.unfinished.items() if not here},
     )
 
 

@@ -68,8 +68,8 @@ def _publish_release(
     release = Release.open(root, own_images=False)
     _check_complete(release, root, pixels)
     check_apart(release, store, "choose another URL")
-    if release.shortfalls and not release.copy:
-        _log.warning("%s lacks a part of %s, which stays unpublished", root, min(release.shortfalls))
+    if not release.copy and (lacking := release.unfinished):
+        _log.warning("%s lacks a part of %s, which stays unpublished", root, min(lacking))
     if (card := release.store.find(README, MANIFEST_BYTES)) and str(release.digest).encode() not in card:
         _log.warning("%s/%s is no card of this version; `dmcvb-gen card %s` writes one", root, README, root)
     text, texts = manifest_text(release), dict(attachments(release.store))

@@ -7,7 +7,7 @@ a folder, values are checked everywhere, a sample of steps is simulated and a sa
 import logging
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +135,10 @@ def verify_folder(
         raise DmcvbError(f"{place} has no episodes yet; run the rollout first")
     for found in in_order(_check_subset, [(subset, backgrounds) for subset in chosen], workers, tick):
         findings += found
-    return _verification(release, chosen, findings, (files, files), sound)
+    result = _verification(release, chosen, findings, (files, files), sound)
+    if names is None and result.sound:
+        result = replace(result, incomplete=result.incomplete | release.unfinished)
+    return result
 
 
 def _verify_bytes(release: Release, everything: bool, tick: ProgressCallback, workers: int) -> Verification:
@@ -185,8 +188,6 @@ def _verification(
     incomplete = {subset.name: (len(subset), subset.record.episodes) for subset in lacking}
     unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
     faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
-    if not faults:
-        incomplete |= release.shortfalls
     return Verification(counts, faults, incomplete, release.digest, release.compared, unchecked, covered)
 
 
