@@ -34,6 +34,8 @@ class PairedReader(SubsetReader):
             _under(subset, spec, name, again=name in names[:place])
             for place, (spec, name) in enumerate(zip(specs, names, strict=True))
         )
+        if len(sizes := {part.record.size for part in self.parts}) > 1:
+            raise DmcvbError(f"{name} has images of {min(sizes)} and {max(sizes)} pixels; pair settings of one size")
         self.looks, self.fresh = len(self.parts), any(part.fresh for part in self.parts)
         everywhere = np.all([np.isin(subset.episodes, part.episodes) for part in self.parts], axis=0)
         self.__dict__["_episodes"] = subset.episodes[everywhere]
