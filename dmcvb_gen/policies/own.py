@@ -44,9 +44,11 @@ class RowGenerator:
         def draw(*args: Any, size: tuple[int, ...] = (), **kwargs: Any) -> np.ndarray:
             if not isinstance(size, tuple) or not size or size[0] != len(self._streams):
                 raise ValueError(f"draw with {name}(..., size=({len(self._streams)}, ...)), one row an observation")
-            if any(np.shape(value) == size for value in (*args, *kwargs.values())):
-                raise ValueError(f"{name} takes one number for all: mean + 0.1 * generator.normal(size=...)")
-            rows = [getattr(stream, name)(*args, size=size[1:], **kwargs) for stream in self._streams]
+            try:
+                rows = [getattr(stream, name)(*args, size=size[1:], **kwargs) for stream in self._streams]
+            except ValueError as error:
+                cure = "its numbers are those of every row: mean + 0.1 * generator.normal(size=...)"
+                raise ValueError(f"{name}: {error}; {cure}") from None
             return np.stack(rows)
 
         return draw

@@ -47,7 +47,7 @@ class Place:
             return cls("file", _folder(text))
         protocol, rest = found[1].lower(), text[found.end() :]
         if protocol in ("file", "local"):
-            return cls("file", _folder(text[len(protocol) + 1 :].removeprefix("//").removeprefix("localhost")))
+            return cls("file", _folder(re.sub("^//(localhost(?=/))?", "", text[len(protocol) + 1 :])))
         if len(found[2]) != 2 and protocol in (*BUCKETS, *WEB, "hf", "s3a", "gcs", "abfs"):
             meant = f"{protocol}://{_without_login(rest)[0]}"
             raise StoreError(f"a URL of {protocol} needs two slashes; did you mean {shown(meant)}?")

@@ -46,7 +46,7 @@ def _of_class(task_id: str, kind: type[Task]) -> Task:
         batch = task.batch(2)
         batch.reset([np.random.default_rng(place) for place in range(2)])
         for _ in range(2):
-            batch.step(np.zeros((2, task.action_size), np.float32))
+            batch.step(task.from_unit(np.zeros((2, task.action_size), np.float32)))
         if batch.state().shape != (2, task.state_size):
             raise DmcvbError(
                 f"{task_id} gives states of shape {batch.state().shape}; let them have the sizes of state_fields: "
