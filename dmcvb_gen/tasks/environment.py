@@ -398,8 +398,7 @@ class _Episode:
         for name, read, value in self._values:
             if read() != value:
                 raise self.error(
-                    f"it changed {name} of the model, which its first episodes left as it was; change it in every "
-                    "episode"
+                    f"it changed {name} of the model, and its first episodes did not; change it in every episode"
                 )
 
     def _warnings(self) -> np.ndarray:

@@ -83,7 +83,7 @@ REFUSED = {
     h.diverges: LATE + "the simulation diverged .mjWARN_BAD",
     h.diverges_quietly: LATE + "the simulation diverged .mjWARN_BAD",
     h.quake: LATE + "changed hfield_data of the model in a step",
-    h.LateChange: LATE + "changed geom_rgba of the model, which its first episodes left as it was",
+    h.LateChange: LATE + "changed geom_rgba of the model, and its first episodes did not",
 }  # fmt: skip
 
 
