@@ -6,6 +6,7 @@ No code in them runs: torch's weights-only loader reads parameters, and of a zip
 
     from                              body                            mean         noise
     SB3 SAC, TQC                      actor.latent_pi.0, .2, ...      actor.mu     actor.log_std
+    SB3 CrossQ                        the same, .1, .4, ...           actor.mu     actor.log_std
     SB3 TD3, DDPG                     actor.mu.0, .2, ...             the last     none
     SB3 PPO, A2C, TRPO                mlp_extractor.policy_net.0, ... action_net   log_std
     CleanRL PPO (continuous)          actor_mean.0, .2, ...           the last     actor_logstd
@@ -13,8 +14,9 @@ No code in them runs: torch's weights-only loader reads parameters, and of a zip
     CleanRL TD3, DDPG                 fc1, fc2, ...                   fc_mu        none
     torch.nn.Sequential               0, 2, ...                       the last     none
 
-Sizes come from the weights and must fit the task. Converted policies act by our fixed-order arithmetic, so their data
-regenerate bit for bit; their actions agree with the other program's to rounding.
+Sizes come from the weights and must fit the task. CrossQ's BatchRenorm goes into the layers that follow it. Converted
+policies act by our fixed-order arithmetic, so their data regenerate bit for bit; their actions agree with the other
+program's to rounding.
 """
 
 from __future__ import annotations
@@ -47,6 +49,9 @@ NO_NOISE = -80.0
 """Log standard deviation of a policy that keeps its mean action alone."""
 WRAPPERS = re.compile(r"^(_orig_mod\.|module\.)+")
 """What torch.compile and DataParallel put before every name."""
+RENORM = re.compile(r"(actor\.latent_pi\.)(\d+)\.ra_mean")
+"""The name of a BatchRenorm's running mean, as CrossQ of sb3-contrib keeps it."""
+RENORM_PARTS = ("ra_mean", "ra_var", "scale", "bias", "steps")
 SCALES = ("action_scale", "action_bias")
 """Names of the half width and the middle of the actions' bounds, as CleanRL keeps them."""
 
@@ -133,6 +138,7 @@ def convert(
     command = f"dmcvb-gen convert-policy {quoted(path)} {quoted(task_id)} --out NEW.safetensors"
     state, data = _read(path)
     facts = None if data is None else facts_of(path, data)
+    state = _without_renorm(path, state, facts.renorm_eps if facts else 0.0)
     layout, body, mean = _layout(path, state)
     if layout.algorithm == "sb3" and facts is None:
         raise PolicyFileError(f"{path} does not say how the policy acts; give the .zip of Stable-Baselines3's save()")
@@ -267,6 +273,23 @@ def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[s
     )
 
 
+def _without_renorm(path: Path, state: Mapping[str, np.ndarray], eps: float) -> dict[str, np.ndarray]:
+    """The same actor without CrossQ's BatchRenorm: what follows one takes over its scale and shift."""
+    plain = dict(state)
+    try:
+        for found in filter(None, map(RENORM.fullmatch, state)):
+            mean, variance, scale, bias, _ = (plain.pop(f"{found[1]}{found[2]}.{part}") for part in RENORM_PARTS)
+            scale = scale / np.sqrt(variance + np.float32(eps))
+            following = f"{found[1]}{int(found[2]) + 1}"
+            for layer in [following] if f"{following}.weight" in state else ["actor.mu", "actor.log_std"]:
+                weight = plain[f"{layer}.weight"]
+                plain[f"{layer}.bias"] = plain[f"{layer}.bias"] + weight @ (bias - mean * scale)
+                plain[f"{layer}.weight"] = weight * scale
+    except (KeyError, ValueError) as error:
+        raise _incomplete(path, error) from None
+    return plain
+
+
 def _check_actions(path: Path, task: Task, low: np.ndarray, high: np.ndarray) -> None:
     """Refuse an actor with other action bounds than the task's: its file does not say how they were taken."""
     theirs = [np.round(bound.astype(float), 6).tolist() for bound in (low, high)]
@@ -322,11 +345,15 @@ def _weights(
             size = len(weights["mean.bias"])
             weights["log_std_vector"] = state[log_std].reshape(size) if log_std else np.full(size, NO_NOISE, np.float32)
     except (KeyError, ValueError, TypeError) as error:
-        raise PolicyFileError(f"{path} lacks a part of its actor ({error}); save its whole state dict") from None
+        raise _incomplete(path, error) from None
     if set(SCALES) <= state.keys():
         half, middle = (state[name].ravel() for name in SCALES)
         _check_actions(path, task, middle - half, middle + half)
     return weights
+
+
+def _incomplete(path: Path, error: Exception) -> PolicyFileError:
+    return PolicyFileError(f"{path} lacks a part of its actor ({error}); save its whole state dict")
 
 
 def _normalization(statistics: str | Path | None, size: int) -> dict[str, np.ndarray]:

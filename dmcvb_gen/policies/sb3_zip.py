@@ -38,6 +38,7 @@ class Facts:
       activation: of hidden layers; None: the algorithm's default.
       steps: that it was trained for.
       normalized: VecNormalize stood before it.
+      renorm_eps: added to the variances of a BatchRenorm.
     """
 
     low: np.ndarray
@@ -46,6 +47,7 @@ class Facts:
     activation: str | None
     steps: int
     normalized: bool
+    renorm_eps: float
 
 
 def read_members(path: Path) -> tuple[bytes, dict[str, Any]]:
@@ -96,6 +98,7 @@ def facts_of(path: Path, data: Mapping[str, Any]) -> Facts:
         activation=activation,
         steps=steps if isinstance(steps, int) and steps >= 0 else 0,
         normalized=data.get("_last_original_obs") is not None,
+        renorm_eps=float(kwargs.get("batch_norm_eps", 0.001)),
     )
 
 

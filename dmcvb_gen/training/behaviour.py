@@ -83,7 +83,8 @@ def train_behaviour(
       out: Folder of the run. [default: runs/TASK, runs/ring for ring.txt]
       steps: Agent steps (at action repeat 2). [default: the task's]
       seed: Random seed. [default: 0]
-      algo: sac, mpo, guided (mazes), or sb3:A2C, DDPG, PPO, SAC, TD3, TQC, TRPO. [default: sac; a maze's file: guided]
+      algo: sac, mpo, guided (mazes), or sb3:A2C, CrossQ, DDPG, PPO, SAC, TD3, TQC, TRPO. [default: sac; a maze's file:
+        guided]
       settings (KEY=VALUE): Override a setting, e.g. learning_rate=0.0003.
       init_from (RUN|FILE): Run or policy file to start from; guided: the policy that walks.
       evaluate_every: Agent steps between evaluations, and so between checkpoints. [default: the task's]

@@ -30,7 +30,7 @@ from dmcvb_gen.training.run import Run
 from dmcvb_gen.training.settings import SB3, Count, Natural, NonNegative
 from dmcvb_gen.training.vec_env import TaskVecEnv
 
-ALGORITHMS = ("A2C", "DDPG", "PPO", "SAC", "TD3", "TQC", "TRPO")
+ALGORITHMS = ("A2C", "CrossQ", "DDPG", "PPO", "SAC", "TD3", "TQC", "TRPO")
 """Those whose actors for continuous actions are plain MLPs, which policy files hold."""
 NOT_SET = ("self", "policy", "env", "device", "verbose", "seed", "tensorboard_log", "_init_setup_model")
 """Arguments of an algorithm that the run gives."""

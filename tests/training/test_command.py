@@ -119,7 +119,7 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
         (["walker-walk", "--set", "foo=1"], "more; --list-settings lists them all."),
         (["walker-walk", "--set", "speed"], "key=value"),
         (["walker-walk", "--set", "discount=1.5"], "setting discount of sac is 1.5: input should be less than 1"),
-        (["walker-walk", "--algo", "sb3:ARS"], "Known: A2C, DDPG, PPO, SAC, TD3, TQC, TRPO."),
+        (["walker-walk", "--algo", "sb3:ARS"], "Known: A2C, CrossQ, DDPG, PPO, SAC, TD3, TQC, TRPO."),
         (["walker-walk", "--algo", "sb3:SAC", "--set", "ent_coef=abc"], "sb3:SAC does not accept"),
         (["walker-walk", "--algo", "sb3:SAC", "--set", "use_sde=true"], "error: sb3:SAC has noise that depends on the"),
         (["walker-walk", "--algo", "sb3:SAC", "--init-from", POLICY], "--init-from has no effect"),

@@ -20,6 +20,7 @@ NET = {"net_arch": [8, 16]}
 TINY = {
     "sb3:SAC": dict(learning_starts=24, batch_size=16, simulations=4, normalize_observation=True),
     "sb3:TQC": dict(learning_starts=24, batch_size=16, policy_kwargs=NET),
+    "sb3:CrossQ": dict(learning_starts=24, batch_size=16),
     "sb3:TD3": dict(learning_starts=24, batch_size=16, action_noise=0.3),
     "sb3:PPO": dict(n_steps=5, batch_size=20, n_epochs=2, normalize_observation=True, normalize_reward=True),
     "sb3:TRPO": dict(n_steps=5, batch_size=20),
