@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-from annotated_types import Gt, Lt
+from annotated_types import Ge, Gt, Lt
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.options import (
@@ -127,7 +127,7 @@ class Made(NamedTuple):
 def make(
     name: str,
     *,
-    episodes: Count | None = None,
+    episodes: Annotated[int, Ge(2)] | None = None,
     release: Location | None = None,
     held_out: Annotated[float, Gt(0), Lt(1)] = 0.1,
     seed: Seed = 0,

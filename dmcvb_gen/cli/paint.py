@@ -53,7 +53,7 @@ def _painted_facts(done):
         known=done.known,
         differing=list(done.differing),
         drift=list(done.drift),
-        complete=not done.release.shortfalls,
+        complete=not any(each.missing(layer).any() for each in done.release.subsets.values() for layer in each.layers),
         digest=done.release.digest,
     )
 

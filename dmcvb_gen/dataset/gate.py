@@ -19,6 +19,7 @@ from typing import Any, Self
 from dmcvb_gen.dataset.manifest import (
     COPY,
     COPY_BYTES,
+    LAYERS,
     MANIFEST,
     MANIFEST_BYTES,
     MANIFESTS,
@@ -102,10 +103,10 @@ class Release:
       digest: SHA-256 of the manifest's bytes; None while it is made.
       compared: whether the digest was compared with one from outside.
       copy: what it was copied from, None if it is no copy.
-      manifest_path: where its manifest lies; in manifests/ if another one has replaced it.
+      manifest_path, text: where its manifest lies, in manifests/ if another one has replaced it; and its bytes.
     """
 
-    manifest_path = MANIFEST
+    manifest_path, text = MANIFEST, b""
 
     def __init__(
         self, store: Store, manifest: Manifest | Resolved, digest: str | None, compared: bool, copy: Copy | None
@@ -151,7 +152,9 @@ class Release:
         if digest not in (None, found):
             path = f"{MANIFESTS}{digest}.json"
             text = store.find(path, MANIFEST_BYTES) or b""
-            if sha256_bytes(text) != digest:
+            if text and sha256_bytes(text) != digest:
+                raise StoreError(f"{store.place}/{path} was altered; fetch release {digest[:12]} again")
+            if not text:
                 raise StoreError(
                     f"{store.place} is release {found}, not {digest}: do not use it for the one that you meant"
                 )
@@ -165,9 +168,10 @@ class Release:
             )
         if own_images and path == MANIFEST and store.folder is not None:
             manifest = _with_own_images(store, manifest)
-        compared = digest is not None or (copy is not None and copy.manifest == found)
+        # A part of a release says of what, but for a part that lies where it was published.
+        compared = digest is not None or (copy is not None and copy.manifest == found and store.folder is not None)
         release = cls(store, manifest, found, compared, copy)
-        release.manifest_path = path
+        release.manifest_path, release.text = path, text
         return release
 
     @classmethod
@@ -432,7 +436,9 @@ def _read_named(store: Store, path: str, digest: str, limit: int, model: type[Pa
     """A file whose name is its own SHA-256. Raises StoreError if it is missing or was altered."""
     text = store.read(path, limit)
     if sha256_bytes(text) != digest:
-        raise StoreError(f"{store.place}/{path} was altered: it does not have its own SHA-256; fetch it again")
+        cure = "fetch it again, or remove it if the manifest does not name it"
+        cure = "`dmcvb-gen regenerate` writes it again" if path.startswith(LAYERS) else cure
+        raise StoreError(f"{store.place}/{path} was altered: it does not have its own SHA-256; {cure}")
     return parse(model, text, f"{store.place}/{path}")
 
 
@@ -445,6 +451,12 @@ def _recipes_at(store: Store) -> list[str]:
     """Digests of all recipes at a place, sorted."""
     found = [re.fullmatch(rf"{RECIPES}([0-9a-f]{{64}})\.json", path) for path in store.list(RECIPES)]
     return sorted(match[1] for match in found if match)
+
+
+def check_videos_shown(records: Iterable[SubsetRecord], given: str | None) -> None:
+    """Raises StoreError if a folder of videos is given and no subset shows any."""
+    if given is not None and all(record.backgrounds is None for record in records):
+        raise StoreError("--backgrounds has no effect: no subset that is asked for shows videos; remove it")
 
 
 def recorded_shards(store: Store, layer: str) -> frozenset[int]:

@@ -13,18 +13,19 @@ function of recipes and records (`build_manifest`), so every process that finish
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import pydantic
 from typing_extensions import TypedDict
 
-from dmcvb_gen.errors import StoreError
+from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import parse_json, sha256_bytes
 from dmcvb_gen.spec import LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec, parse_setting
 
@@ -441,7 +442,7 @@ class Copy(_Model):
     def _bounded(self) -> Copy:
         for layer, each in self.promised.items():
             bounds = [number for run in each for number in run]
-            if bounds != sorted({*bounds} & {*range(MAX_SHARDS + 1)}):
+            if bounds != sorted({*bounds}) or bounds and not 0 <= bounds[0] <= bounds[-1] <= MAX_SHARDS:
                 raise ValueError(f"the shards of {layer} are not runs of numbers in order")
         if sum(last - first for each in self.promised.values() for first, last in each) > 10 * MAX_SHARDS:
             raise ValueError(f"it has more shards than the {10 * MAX_SHARDS:,} that a release may have")
@@ -488,11 +489,26 @@ def parse(model: type[Parsed], text: bytes, where: str) -> Parsed:
     except ValueError as error:
         raise StoreError(f"{where} is not JSON ({error}); remove it and fetch again, or make a new one") from None
     try:
-        return model.model_validate(data)
+        found = model.model_validate(data)
     except pydantic.ValidationError as error:
         first = min(error.errors(), key=lambda one: one["loc"] != ("schema_version",))  # which tells the most
         place, cure = ".".join(map(str, first["loc"])) or "the top", "fetch it again, or install the dmcvb-gen of it"
         raise StoreError(f"{where} is not valid at {place}: {first['msg']}; {cure}") from None
+    with contextlib.suppress(ValueError):  # of a number without end
+        if canonical_json(data) == text:
+            return found
+    raise StoreError(f"{where} was not written by dmcvb-gen, or changed since; fetch it again, or make a new one")
+
+
+@contextlib.contextmanager
+def describable() -> Iterator[None]:
+    """Raises DmcvbError, in one line, for what no release may be made of."""
+    try:
+        yield
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or error.title
+        raise DmcvbError(f"{field} is not as a release may have it: {first['msg']}; change it") from None
 
 
 def record_path(layer: str, shard: int) -> str:
@@ -560,7 +576,8 @@ def _difference(one: Layer, other: Layer) -> str:
     pairs = {key: (one.makes.get(key), other.makes.get(key)) for key in keys}
     pairs |= {name: (getattr(one, name), getattr(other, name)) for name in fields}
     pairs["arrays"] = (_arrays(one, other), _arrays(other, one))
-    field, first, second = next((name, *pair) for name, pair in pairs.items() if pair[0] != pair[1])
+    differing = [(name, *pair) for name, pair in pairs.items() if pair[0] != pair[1]]
+    field, first, second = differing[0] if differing else ("arrays", "one form", "another form of the same arrays")
     images = field == "arrays" and other.kind == "images"
     paint = f"add these images with `paint --size {other.arrays[0].shape[0]}`, or " if images else ""
     return f"{one.name} has {field} {shortened(first)}, asked for {shortened(second)}; {paint}choose another --out"
@@ -600,7 +617,7 @@ def build_manifest(
         return None
     subsets = merged_subsets(subset for _, subset in whole)
     needed: dict[str, int] = {}
-    for _, subset in whole:
+    for subset in subsets.values():
         for name in subset.layers:
             needed[name] = max(needed.get(name, 0), layers[name].shards_for(subset.episodes))
     made = {name: LayerList(shards=lists[name][:count]) for name, count in sorted(needed.items())}
@@ -628,7 +645,7 @@ def _without_needless(whole: Iterable[tuple[Resolved, SubsetRecord]]) -> list[Re
     for digest, (recipe, subsets) in sorted(asked.items()):
         covering: dict[str, list[SubsetRecord]] = {}
         for sha256, (other, theirs) in asked.items():
-            if sha256 != digest and _described(other) == _described(recipe):
+            if sha256 != digest and _can_stand_for(other, recipe):
                 for subset in theirs:
                     covering.setdefault(subset.name, []).append(subset)
         if all(any(_merged(more, one) == more for more in covering.get(one.name, ())) for one in subsets):
@@ -636,9 +653,10 @@ def _without_needless(whole: Iterable[tuple[Resolved, SubsetRecord]]) -> list[Re
     return [recipe for recipe, _ in asked.values()]
 
 
-def _described(recipe: Resolved) -> tuple[Any, ...]:
-    """What must be equal for one recipe to stand for another; one that `paint` made names no policies."""
-    return bool(recipe.recipe), recipe.derived, *(getattr(recipe, name) for name in SAID)
+def _can_stand_for(other: Resolved, recipe: Resolved) -> bool:
+    """Return True if a recipe says all that another one does; one that `paint` made names no policies."""
+    same = all(getattr(other, name) == getattr(recipe, name) for name in ("derived", *SAID))
+    return same and (bool(other.recipe) or not recipe.recipe)
 
 
 def layer_facts(layer: Layer) -> dict[str, Any]:

@@ -189,7 +189,7 @@ class Subset:
     def _layer_of(self, name: str) -> tuple[Layer, ArraySpec]:
         if name not in self._specs:
             if name in shown(self).arrays:
-                raise StoreError(self._without_images)
+                raise StoreError(self._without_images())
             raise UnknownNameError(f"array of {self.name}", name, self.arrays)
         return self._specs[name]
 
@@ -221,17 +221,17 @@ class Subset:
                 if number in here and name in record.files
             }
             array = open_array(layer, spec, self.record.episodes, ZarrFiles(self.release.store, prefix, files))
-            cure = self._without_images if layer.kind == "images" else self._not_here
+            cure = self._without_images(layer) if layer.kind == "images" else self._not_here
             place = f"{self.release.place}/{prefix}"
             self._opened[name] = StoredArray(array, name, place, self.missing(layer), cure)
         return self._opened[name]
 
-    @property
-    def _without_images(self) -> str:
-        return (
-            f"{self.name} has episodes without images; add them: `dmcvb-gen paint {quoted(self.release.place)}` "
-            "(in Python, dmcvb_gen.open(..., paint=True) renders them as they are read)"
-        )
+    def _without_images(self, layer: Layer | None = None) -> str:
+        size = layer.arrays[0].shape[0] if layer else self.record.size
+        option = f" --size {size}" if size != self.record.size else ""
+        python = "" if option else " (in Python, dmcvb_gen.open(..., paint=True) renders them as they are read)"
+        command = f"dmcvb-gen paint {quoted(self.release.place)}{option}"
+        return f"{self.name} has episodes without images; add them: `{command}`{python}"
 
     @property
     def _not_here(self) -> str:

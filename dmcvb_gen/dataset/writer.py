@@ -31,6 +31,7 @@ from dmcvb_gen.dataset.manifest import (
     POLICIES,
     PROVENANCE,
     RECIPES,
+    RECORDS,
     VIDEOS,
     ZARR_JSON,
     Copy,
@@ -53,6 +54,7 @@ from dmcvb_gen.dataset.schema import array_metadata, encode
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.storage.store import NotThere, Store
+from dmcvb_gen.text import quoted
 
 PROVENANCE_BYTES = 2**20
 ROW_LAYOUT = "row t: observation t, action t, reward of action t; row `length`: the last observation alone"
@@ -79,7 +81,8 @@ def put(store: Store, path: str, data: bytes | Path, *, first_wins: bool = False
         return there
     raise StoreError(
         f"{store.place}/{path} exists with other bytes (SHA-256 {there.sha256[:12]}, made by {makers(store)}) than "
-        f"{_versions(environment())} makes ({mine.sha256[:12]}); use those versions, or choose another place"
+        f"{_versions(environment())} makes ({mine.sha256[:12]}); use those versions, choose another place, or remove "
+        "the file if it is damaged"
     )
 
 
@@ -110,6 +113,9 @@ def begin(store: Store, recipe: Resolved, inputs: Mapping[str, Path | bytes]) ->
         raise StoreError(
             f"{store.place} holds no release but other files ({strange[0]}); choose an empty place for --out"
         )
+    for parent in store.folder.resolve().parents if store.folder else ():
+        if (parent / RECIPES).is_dir() and (parent / RECORDS).is_dir():
+            raise StoreError(f"{store.place} lies in the release {parent}; choose another --out")
     if store.size(COPY) is not None and not _adds_images_alone(Release.open(store), recipe):
         raise StoreError(f"{store.place} is a copy of a release and does not grow; choose another --out")
     check_agree([*there, recipe])
@@ -195,6 +201,19 @@ def wrong_bytes(store: Store, file: FileRecord) -> str | None:
         return f"cannot be read: {error}"
 
 
+def read_checked(store: Store, file: FileRecord) -> bytes:
+    """The bytes of a file of a release.
+
+    Raises:
+      StoreError: it is missing, or its bytes are not as recorded.
+    """
+    data = store.read(file.path, file.bytes)
+    if sha256_bytes(data) != file.sha256:
+        cure = f"run `dmcvb-gen regenerate {quoted(store.place)}`"
+        raise StoreError(f"{store.place}/{file.path} does not have its digest; {cure}")
+    return data
+
+
 def put_back(store: Store, file: FileRecord, data: bytes | Path) -> None:
     """Put a file in the place of a missing or damaged one, if it has the recorded SHA-256; else change nothing.
 
@@ -250,7 +269,7 @@ def finish(store: Store) -> Release:
         release = Release.open(store)
         write_plain_metadata(release)
         if store.version(MANIFEST) is None or Release.open(store).digest == release.digest:
-            return release  # else another process has finished more meanwhile
+            return _ended(release) if release.copy else release  # else another process has finished more meanwhile
 
 
 def _listed_records(store: Store) -> dict[str, dict[int, ShardRecord]]:
@@ -340,9 +359,14 @@ def finish_copy(store: Store, manifest_text: bytes, source: str, shards: Iterabl
         store.replace(MANIFEST, manifest_text)
     release = Release.open(store)
     write_plain_metadata(release)
+    return _ended(release)
+
+
+def _ended(release: Release) -> Release:
+    """A release, which is a copy no more if all is here."""
     listed = [layer for layer in release.manifest.layers if isinstance(layer, ListedLayer)]
     if all(len(release.here(layer.name)) == layer.shards for layer in listed):
-        store.delete(COPY)
+        release.store.delete(COPY)
     return release
 
 

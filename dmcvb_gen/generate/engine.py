@@ -21,10 +21,9 @@ import numpy as np
 
 from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ShardFile, ShardRecord, SubsetRecord
 from dmcvb_gen.dataset.schema import decode, encode
-from dmcvb_gen.dataset.writer import file_facts, put, put_back, put_record, wrong_bytes
+from dmcvb_gen.dataset.writer import file_facts, put, put_back, put_record, read_checked, wrong_bytes
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
 from dmcvb_gen.generate.render import (
     distractor_state_of,
@@ -43,7 +42,6 @@ from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.storage.store import Store
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
-from dmcvb_gen.text import quoted
 
 ANY_BITS = ("opengl",)
 """Renderers whose images may differ from machine to machine: the first shard that is put is the release's."""
@@ -263,12 +261,8 @@ def read_shard(work: Work, layer: Layer, names: Sequence[str]) -> dict[str, np.n
 
 
 def _read_array(store: Store, layer: Layer, spec: ArraySpec, shard: int, record: ShardRecord) -> np.ndarray:
-    file, path = record.files.get(spec.name), layer.file_path(spec, shard)
-    data = store.read(path, file.bytes) if file else None
-    if file and sha256_bytes(data or b"") != file.sha256:
-        cure = f"run `dmcvb-gen regenerate {quoted(store.place)}`"
-        raise StoreError(f"{store.place}/{path} does not have its digest; {cure}")
-    return decode(layer, spec, data)
+    file = record.files.get(spec.name)
+    return decode(layer, spec, read_checked(store, file.at(layer.file_path(spec, shard))) if file else None)
 
 
 # -- images ---------------------------------------------------------------------------------------

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from dmcvb_gen.dataset.environment import environment
-from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import SAID, Layer, Resolved, SubsetRecord, layer_facts, layer_order
+from dmcvb_gen.dataset.gate import Release, check_videos_shown
+from dmcvb_gen.dataset.manifest import SAID, Layer, Resolved, SubsetRecord, describable, layer_facts, layer_order
 from dmcvb_gen.dataset.pictures import Pictures
 from dmcvb_gen.dataset.writer import begin, finish, read_provenance, write_provenance
 from dmcvb_gen.errors import DmcvbError, StoreError
@@ -107,6 +107,7 @@ def paint_release(
     store, wanted = place if isinstance(place, Store) else open_store(place), wanted or Wanted()
     release = Release.open(store)
     records = not_imported(release, chosen_subsets(release, only))
+    check_videos_shown(records, backgrounds)
     root = local_inputs(store, release.inputs_of([record.name for record in records]))
     sources = {record.name: background_source(root, record, backgrounds) for record in records}
     layers = {record.name: _layers_of(release, record, wanted, sources[record.name]) for record in records}
@@ -163,6 +164,7 @@ def _recipe_with(release: Release, records: Iterable[SubsetRecord], layers: Mapp
     return recipe_after(release, described.values(), subsets)
 
 
+@describable()
 def recipe_after(release: Release, layers: Iterable[Layer], subsets: Iterable[SubsetRecord], **facts: Any) -> Resolved:
     """The recipe of other layers and subsets with a release's name, license and so on; `facts`: what else it says."""
     kept = {name: getattr(release.manifest, name) for name in SAID}

@@ -15,7 +15,7 @@ from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.recipe import Recipe
 from dmcvb_gen.generate.request import RECIPE_OPTIONS, make_request
 from dmcvb_gen.generate.resolve import Resolution, resolve
-from dmcvb_gen.generate.works import Work, episodes_left, works_of
+from dmcvb_gen.generate.works import Work, check_makeable, episodes_left, works_of
 from dmcvb_gen.options import refuse
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.storage.store import Store, open_store
@@ -116,6 +116,7 @@ def make_plan(
     else:
         raise StoreError(f"{store.place} holds no release to go on with; give TASKs or --recipe")
     works = works_of(release, only, episodes, part=part)
+    check_makeable(release.manifest, {setting.record.name for work in works for setting in work.settings})
     everything = works_of(release, only, episodes, wanted=lambda layer, shard: True)
     return Plan(release, resolution, works, episodes_left(everything), there is not None)
 

@@ -7,11 +7,11 @@ damaged or missing, if they come out with their recorded digests. `remake` write
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dmcvb_gen.dataset.gate import Release, read_records
+from dmcvb_gen.dataset.gate import Release, check_videos_shown, read_records
 from dmcvb_gen.dataset.manifest import LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
 from dmcvb_gen.dataset.writer import (
     begin,
@@ -31,7 +31,7 @@ from dmcvb_gen.generate.inputs import local_inputs, policy_files, video_source
 from dmcvb_gen.generate.paint import environment_diff
 from dmcvb_gen.generate.resolve import video_files
 from dmcvb_gen.generate.shipped import Shipped, record_digests
-from dmcvb_gen.generate.works import Work, chosen_subsets, works_of
+from dmcvb_gen.generate.works import Work, check_makeable, chosen_subsets, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.spec import select
 from dmcvb_gen.storage.store import Store, open_store
@@ -123,6 +123,7 @@ class Regeneration:
 
     def _works(self, release: Release, wanted, purpose) -> tuple[Work, ...]:
         check_makeable(release.manifest, release.select(self.only))
+        check_videos_shown(chosen_subsets(release, self.only), self.backgrounds)
         return works_of(release, self.only, self.episodes, wanted, backgrounds=self.backgrounds, purpose=purpose)
 
     def run(self, works: Sequence[Work], progress: ProgressCallback) -> tuple[ShardOutcome, ...]:
@@ -214,17 +215,6 @@ def input_files(store: Store, described: Resolved | Manifest, backgrounds: str |
         if file.path not in found:
             raise StoreError(f"{file.path} is neither in {store.place} nor given; give --backgrounds FOLDER")
     return found
-
-
-def check_makeable(described: Resolved | Manifest, names: Iterable[str]) -> None:
-    """Raises StoreError for subsets whose shards cannot be made from the manifest."""
-    chosen = set(names)
-    for record in described.subsets:
-        if record.name in chosen and record.imported:
-            raise StoreError(
-                f"{record.name} was imported, so there is nothing to make it from; import it again, or choose other "
-                "subsets with --only"
-            )
 
 
 def restore_lists(store: Store) -> list[str]:

@@ -15,9 +15,8 @@ from typing import Any, cast
 
 from dmcvb_gen.dataset.gate import Release, Shard, read_recipes
 from dmcvb_gen.dataset.manifest import VIDEOS, Layer, Resolved, SubsetRecord
-from dmcvb_gen.dataset.writer import begin, finish, put, put_record, write_provenance, wrong_bytes
+from dmcvb_gen.dataset.writer import begin, finish, put, put_record, read_checked, write_provenance, wrong_bytes
 from dmcvb_gen.errors import RecipeError, StoreError
-from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files, whose_videos
 from dmcvb_gen.generate.paint import bare, not_imported, recipe_after
@@ -198,9 +197,5 @@ def _check_out(store: Store, resolved: Resolved) -> None:
 def _copy(source: Store, target: Store, shard: Shard) -> None:
     """Copy the files of a shard, each compared with its digest, then its record."""
     for file in shard.files:
-        data = source.read(file.path, file.bytes)
-        if sha256_bytes(data) != file.sha256:
-            cure = f"run `dmcvb-gen regenerate {quoted(source.place)}`"
-            raise StoreError(f"{source.place}/{file.path} is damaged; {cure}")
-        put(target, file.path, data)
+        put(target, file.path, read_checked(source, file))
     put_record(target, shard.layer, shard.number, shard.record)

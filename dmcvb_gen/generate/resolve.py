@@ -30,6 +30,7 @@ from dmcvb_gen.dataset.manifest import (
     PolicyRecord,
     Resolved,
     SubsetRecord,
+    describable,
     shard_size,
 )
 from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
@@ -70,6 +71,7 @@ class Resolution:
     files: Mapping[str, Path] = field(default_factory=dict)
 
 
+@describable()
 def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -> Resolution:
     """Resolve a recipe.
 
@@ -157,7 +159,10 @@ def file_records(files: Mapping[str, Path]) -> tuple[FileRecord, ...]:
 
 
 def _episodes_per_shard(name: str, members: Sequence[SubsetRequest], there: Release | None) -> int:
-    given = next((request.episodes_per_shard for request in members if request.episodes_per_shard), None)
+    asked = {request.episodes_per_shard for request in members if request.episodes_per_shard}
+    if len(asked) > 1:
+        raise RecipeError(f"settings of {name} share their shards; give them one episodes_per_shard")
+    given = next(iter(asked), None)
     old = there.layers.get(f"{name}/trajectories") if there else None
     if old is not None:
         if given and given != old.episodes_per_shard:

@@ -7,12 +7,12 @@ each setting's labels are drawn (or read) and its images rendered.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import FileRecord, Layer, ListedLayer, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset.manifest import FileRecord, Layer, ListedLayer, Manifest, Resolved, ShardRecord, SubsetRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.store import Store
 
@@ -117,6 +117,17 @@ def works_of(
             work = Work(release.store, release.layers[name], shard, settings, make, known, inputs, **facts)  # type: ignore[arg-type]
             found.append(work)
     return tuple(found)
+
+
+def check_makeable(described: Resolved | Manifest, names: Iterable[str]) -> None:
+    """Raises StoreError for subsets whose shards cannot be made from the manifest."""
+    chosen = set(names)
+    for record in described.subsets:
+        if record.name in chosen and record.imported:
+            raise StoreError(
+                f"{record.name} was imported, so there is nothing to make it from; import it again, or choose other "
+                "subsets with --only"
+            )
 
 
 def chosen_subsets(release: Release, only: Sequence[str] = ()) -> list[SubsetRecord]:

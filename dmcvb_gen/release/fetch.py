@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.dataset.gate import Release, Shard, recorded_shards
-from dmcvb_gen.dataset.manifest import FileRecord, ListedLayer, list_path
+from dmcvb_gen.dataset.manifest import MANIFEST, FileRecord, ListedLayer, list_path
 from dmcvb_gen.dataset.writer import finish_copy, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
 from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
 from dmcvb_gen.options import Count, Local, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, expect
-from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at, manifest_text
+from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path, shown
 from dmcvb_gen.storage.store import Store, open_store
@@ -94,7 +94,7 @@ def _fetch(
             f"{source.place} is not finished; finish it first: dmcvb-gen rollout --out {quoted(source.place)}"
         )
     check_apart(source, target, f"choose another --out, or render its images: dmcvb-gen paint {quoted(source.place)}")
-    there, text = manifest_at(target, source), manifest_text(source)
+    there, text = manifest_at(target, source), source.text
     shards = [shard for shard in source.shards(names, episodes) if shard.here]
     if not shards:
         raise StoreError(f"{source.place} has none of these episodes; it has others, see `dmcvb-gen info`")
@@ -106,7 +106,7 @@ def _fetch(
     download.bring(first)
     download.bring_shards(shards)
     download.bring(last)
-    for path, data in attachments(source.store):
+    for path, data in attachments(source.store) if source.manifest_path == MANIFEST else ():  # they are of the newest
         if download.repair or there not in (None, text) or target.size(path) is None:
             target.replace(path, data)
     finish_copy(target, text, shown(url), [*shards, *kept])

@@ -25,7 +25,7 @@ from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.options import Count, Location, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, expect
 from dmcvb_gen.release.fetch import Moved
-from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at, manifest_text
+from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.text import quoted
 
@@ -72,7 +72,7 @@ def _publish_release(
         _log.warning("%s lacks a part of %s, which stays unpublished", root, min(lacking))
     if (card := release.store.find(README, MANIFEST_BYTES)) and str(release.digest).encode() not in card:
         _log.warning("%s/%s is no card of this version; `dmcvb-gen card %s` writes one", root, README, root)
-    text, texts = manifest_text(release), dict(attachments(release.store))
+    text, texts = release.text, dict(attachments(release.store))
     store.begin()
     tag = store.version(MANIFEST)
     there = manifest_at(store, release)

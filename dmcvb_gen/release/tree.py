@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
-from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.gate import Release, read_recipes
 from dmcvb_gen.dataset.manifest import (
     ATTACHMENT_FILES,
     CARD_FOLDER,
@@ -20,14 +20,14 @@ from dmcvb_gen.dataset.manifest import (
     LayerList,
     ListedLayer,
     Manifest,
+    Resolved,
     canonical_json,
     file_of,
     is_attachment,
     list_path,
 )
-from dmcvb_gen.dataset.writer import PROVENANCE_BYTES
+from dmcvb_gen.dataset.writer import PROVENANCE_BYTES, check_agree
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.storage.store import Store
 
 ATTACHMENTS = (*ATTACHMENT_FILES, f"{CARD_FOLDER}contact_sheet.png", f"{CARD_FOLDER}episodes.parquet")
@@ -57,18 +57,6 @@ def list_files(release: Release, layers: Collection[str]) -> tuple[FileRecord, .
     return tuple(found.values())
 
 
-def manifest_text(release: Release) -> bytes:
-    """The bytes of the manifest of a finished release.
-
-    Raises:
-      StoreError: it was replaced since the release was opened.
-    """
-    text = release.store.read(release.manifest_path, MANIFEST_BYTES)
-    if sha256_bytes(text) != release.digest:
-        raise StoreError(f"{release.place} was changed meanwhile; run the command again")
-    return text
-
-
 def attachments(store: Store) -> Iterator[tuple[str, bytes]]:
     """Paths and bytes of the attachments that are there, and of the notes of who made the release."""
     try:
@@ -91,7 +79,7 @@ def grows_from(new: Release, old: Release) -> bool:
         if name not in new.layers or new.layers[name].key != layer.key:
             return False
         records = new.records(name)
-        if any(records.get(number) != record for number, record in old.records(name).items()):
+        if any(records.get(shard.number) != shard.record for shard in old.layer_shards(name)):
             return False
     episodes = {record.name: record.episodes for record in new.manifest.subsets}
     return all(record.episodes <= episodes.get(record.name, 0) for record in old.manifest.subsets)
@@ -122,7 +110,7 @@ def manifest_at(store: Store, release: Release) -> bytes | None:
             f"{store.place} already holds {_named(there)} and not {_named(release)}, and a release never changes; "
             "choose another place (a changed byte is a new version)"
         )
-    ours = {COPY, *(f"{RECIPES}{recipe.sha256}.json" for recipe in release.recipes)}
+    ours = {COPY, *(f"{RECIPES}{recipe.sha256}.json" for recipe in (*release.recipes, *_older_recipes(store, release)))}
     ours |= {file.path for file in release.manifest.inputs}
     folders, found = folders_of(release), list(store.list())
     others = [path for path in found if path not in ours and not path.startswith(folders)]
@@ -132,6 +120,16 @@ def manifest_at(store: Store, release: Release) -> bytes | None:
         more = f" and {len(others) - 1} more" if others[1:] else ""
         raise StoreError(f"{store.place} holds {others[0]}{more}, and not this release; choose an empty destination")
     return None
+
+
+def _older_recipes(store: Store, release: Release) -> list[Resolved]:
+    """Recipes at a place that an older version of a release may have left there, in an interrupted try."""
+    older = [recipe for recipe in read_recipes(store) if recipe.name == release.manifest.name]
+    try:
+        check_agree([*older, *release.recipes])
+    except StoreError:
+        return []
+    return older
 
 
 def check_apart(release: Release, target: Store, cure: str) -> None:

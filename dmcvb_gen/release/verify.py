@@ -4,6 +4,7 @@ The manifest names lists, lists name files; each is compared with its SHA-256 wh
 a folder, values are checked everywhere, a sample of steps is simulated and a sample of frames rendered.
 """
 
+import contextlib
 import logging
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,15 +14,29 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import COPY, MANIFEST, RECIPES, ZARR_JSON, FileRecord, file_of, is_attachment
+from dmcvb_gen.dataset.gate import Release, check_videos_shown, read_recipes
+from dmcvb_gen.dataset.manifest import (
+    COPY,
+    LAYERS,
+    MANIFEST,
+    MANIFEST_BYTES,
+    MANIFESTS,
+    PROVENANCE,
+    RECIPES,
+    RECORDS,
+    ZARR_JSON,
+    FileRecord,
+    file_of,
+    is_attachment,
+    merged_layers,
+)
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.writer import plain_metadata, wrong_bytes
 from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreError, UnknownNameError
 from dmcvb_gen.options import Location, checked, progress_bar, refuse
 from dmcvb_gen.parallel import Pool, ProgressCallback, Ray, Workers, expect, ignore, in_order
 from dmcvb_gen.release.issue import NOT_PART, UNCHECKED, Issue
-from dmcvb_gen.release.tree import described_files, folders_of, list_files
+from dmcvb_gen.release.tree import described_files, list_files
 from dmcvb_gen.storage.places import is_url
 
 SAMPLE_FILES = 40
@@ -126,6 +141,7 @@ def verify_folder(
       DmcvbError: there is no release, or it has no shards yet.
     """
     release = Release.open(place)
+    check_videos_shown(release.manifest.subsets, backgrounds)
     files, findings = _expected(release)
     expect(tick, len(files) + len(release.manifest.subsets))
     findings += [*_wrong(release, files, tick, THREADS), *_strange(release, files)]
@@ -210,6 +226,8 @@ def _expected(release: Release) -> tuple[list[Listed], list[Issue]]:
     names = [record.name for record in release.manifest.subsets if {*record.layers} <= usable]
     try:
         files += [(file.path, file) for file in described_files(release, names)]
+        if release.store.folder:
+            read_recipes(release.store)  # those that the manifest does not name, too
     except StoreError as error:
         findings.append(Issue("files", RECIPES, str(error)))
     if not release.in_the_making and not findings:
@@ -249,12 +267,31 @@ def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
     """Files that belong to no release."""
     known = {file.path for _, file in files} | {MANIFEST, COPY}
     unplanned = not any(path.endswith(ZARR_JSON) for path in known)  # as something else is damaged
-    folders = (RECIPES, PREVIEWS, *folders_of(release))
+    making = dict(release.layers)
+    with contextlib.suppress(StoreError):  # which was told
+        making |= merged_layers(read_recipes(release.store))
+    arrays = tuple(f"{layer.group}/{spec.stored_name}/c/" for layer in making.values() for spec in layer.arrays)
+    folders = (RECORDS, LAYERS, MANIFESTS, RECIPES, PROVENANCE, PREVIEWS, *arrays)
+    empty = set() if unplanned else _empty(release)
     for path in release.store.list() if release.manifest_path == MANIFEST else ():
-        if path.endswith(ZARR_JSON) and unplanned:
+        if path in known or is_attachment(path) or (path.endswith(ZARR_JSON) and unplanned):
             continue
-        if path not in known and not path.startswith(folders) and not is_attachment(path):
+        if not path.startswith(folders) or path in empty:
             yield Issue("files", path, f"{NOT_PART}; move it elsewhere")
+        elif path.startswith((LAYERS, MANIFESTS)) and release.store.sha256(path, MANIFEST_BYTES) != Path(path).stem:
+            yield Issue("files", path, "was altered, an older version needs it; fetch that again, or remove it")
+
+
+def _empty(release: Release) -> set[str]:
+    """Paths that shards which are here leave free, because an array holds nothing but its fill value."""
+    return {
+        layer.file_path(spec, shard.number)
+        for name, layer in release.layers.items()
+        for shard in release.layer_shards(name)
+        if shard.here
+        for spec in layer.arrays
+        if spec.name not in shard.record.files
+    }
 
 
 # -- values ---------------------------------------------------------------------------------------

@@ -91,6 +91,22 @@ def test_images_are_added_as_further_layers(store):
     assert here.items() <= {layer.name: layer.list for layer in painted.manifest.layers}.items()
 
 
+def test_images_that_are_added_after_a_growth_are_listed(store):
+    for count, images in ((3, False), (3, True), (5, False)):
+        made_up.make(store, made_up.recipe(count, images=images))
+    for layer in made_up.recipe(5).layers:
+        if layer.kind == "images":
+            put_shard(store, layer, 2, made_up.values(layer, 2))
+    grown = finish(store)
+    assert not any(subset.unpainted.any() for subset in grown.subsets.values()) and not grown.unfinished
+
+
+def test_what_was_painted_first_is_the_release_that_is_made_at_once(store, tmp_path):
+    at_once = made_up.recipe(5).model_copy(update={"recipe": {"name": "hop"}})  # `paint` writes none
+    made_up.make(store, made_up.recipe(5))
+    assert made_up.make(store, at_once).digest == made_up.make(open_store(tmp_path / "other"), at_once).digest
+
+
 def test_plain_readers_see_images_that_are_not_the_first(store):
     made_up.make(store, made_up.recipe(5, images=False))
     wanted = made_up.recipe(5)

@@ -141,7 +141,7 @@ def test_a_damaged_source_is_not_painted(copy, tmp_path):
     data = bytearray(path.read_bytes())
     data[100] ^= 255
     path.write_bytes(data)
-    with pytest.raises(StoreError, match="physics.*is damaged; run `dmcvb-gen regenerate"):
+    with pytest.raises(StoreError, match="physics.*does not have its digest; run `dmcvb-gen regenerate"):
         repaint(Repainting(copy, tmp_path / "r", ["*/*/none"], size=8))
 
 

@@ -71,6 +71,16 @@ def test_a_release_comes_back_as_it_went(made, place, tmp_path):
         fetch(f"{url}@sha256:{'0' * 64}", tmp_path / "x", **options)
 
 
+def test_what_an_interrupted_publish_of_an_older_version_left_is_adopted(made, tmp_path):
+    there = tmp_path / "there"
+    publish(made, f"file:{there}")
+    for path in (there / MANIFEST, *there.rglob("zarr.json")):  # which are written last
+        path.unlink()
+    make(open_store(made), recipe(5))
+    publish(made, f"file:{there}")
+    assert Release.open(there).digest == Release.open(made).digest and not wrong_files(there)
+
+
 def test_a_part_is_a_copy_that_can_be_completed(made, tmp_path):
     url, part, digest, name = f"file:{made}", tmp_path / "part", Release.open(made).digest, "hop/random/none"
     fetch(url, part, ["*/none"], (2, 3))
@@ -106,6 +116,7 @@ def test_a_grown_release_takes_the_place_of_the_older(made, place, tmp_path):
     (url, options), back = place, tmp_path / "back"
     publish(made, url, **options)
     fetch(url, back, **options)
+    fetch(url, tmp_path / "part", ["*/none"], (0, 1), **options)
     shutil.copytree(made, tmp_path / "old")
     old = Release.open(made).digest
     make(open_store(made), recipe(5))
@@ -113,6 +124,8 @@ def test_a_grown_release_takes_the_place_of_the_older(made, place, tmp_path):
     fetch(url, back, ["*/none"], **options)
     assert len(Release.open(back)["hop/random/none"]) == 5 and not wrong_files(back)
     assert len(Release.open(back)["hop/random/dynamic"].read("pixels")) == 4  # of the shards that came before
+    fetch(url, tmp_path / "part", ["*/none"], **options)
+    assert len(Release.open(tmp_path / "part")["hop/random/none"]) == 5
     assert sha256_bytes(content(url, **options)[f"manifests/{old}.json"]) == old
     for replaced in (Release.open(url, *options.values(), digest=old), Release.open(back, digest=old)):
         assert replaced.compared and len(replaced["hop/random/none"].read("state")) == 3

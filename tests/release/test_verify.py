@@ -129,7 +129,8 @@ def test_files_that_no_digest_speaks_of_are_named(copy):
         (copy / path).parent.mkdir(exist_ok=True)
         (copy / path).write_bytes(b"x")
     assert not wrong_files(copy)
-    strange = {"notes.txt", "policies/other.safetensors"}
+    empty = "walker-walk/random.zarr/trajectories/terminated/c/0"  # which holds its fill value alone
+    strange = {"notes.txt", "policies/other.safetensors", "walker-walk/stray", empty, f"manifests/{'0' * 64}.json"}
     for path in strange:
         (copy / path).parent.mkdir(exist_ok=True)
         (copy / path).write_bytes(b"stray")
