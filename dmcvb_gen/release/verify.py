@@ -26,6 +26,8 @@ from dmcvb_gen.dataset.manifest import (
     RECORDS,
     ZARR_JSON,
     FileRecord,
+    build_manifest,
+    canonical_json,
     file_of,
     is_attachment,
     merged_layers,
@@ -145,6 +147,11 @@ def verify_folder(
     files, findings = _expected(release)
     expect(tick, len(files) + len(release.manifest.subsets))
     findings += [*_wrong(release, files, tick, THREADS), *_strange(release, files)]
+    if release.text and not release.copy and not findings:
+        lists = {layer.name: tuple(release.records(layer.name).values()) for layer in release.manifest.layers}
+        built = build_manifest(release.recipes, lists)
+        if built is None or canonical_json(built[0]) != release.text:
+            findings.append(Issue("files", MANIFEST, "does not follow from recipes and records; fetch it again"))
     sound = _sound(release, findings)
     chosen = [subset for subset in sound if len(subset) and (names is None or subset.name in names)]
     if not findings and not any(map(len, sound)):

@@ -184,12 +184,18 @@ def test_shipped_recipes_expand_to_what_the_paper_has():
     assert len(whole) == 36 + 7 * 2 * 2 + 7
 
 
+SUBSET = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2}
+BIG_SHARDS = SUBSET | {"episodes": 50, "max_steps": 1000}
+SHARED = [SUBSET | {"settings": name, "episodes_per_shard": count} for name, count in (("none", 1), ("static", 2))]
 NONSENSE = [
     ({"seed": -1}, RecipeError, "seed"),
     ({"name": "a/b"}, RecipeError, "name"),
     ({"colour": "red"}, RecipeError, "colour"),
     ({"action_repeat": 3}, RecipeError, "action_repeat: Input should be 1, 2 or 4"),
     ({"backgrounds": "/nowhere"}, DmcvbError, "give a folder of videos"),
+    ({"license": "CC\nBY"}, DmcvbError, "license is not as a release may have it"),
+    ({"size": 1024, "subsets": [BIG_SHARDS]}, DmcvbError, "is not as a release may have it: .*shards"),
+    ({"subsets": SHARED}, RecipeError, "share their shards"),
     ({"subsets": []}, RecipeError, "subsets"),
     ({"subsets": [{"task": "walker-walk"}]}, RecipeError, "unknown field 'task'.*'tasks'"),
     ({"renderer": {"backend": "native", "sample": 2}}, RecipeError, "unknown field 'sample'. Did you mean 'samples'"),
@@ -204,7 +210,6 @@ NONSENSE_OF_SUBSETS = [
     ({"policies": {"random": "x"}}, "has no use"),
     ({"levels": "expert", "policies": {"expert": "/nowhere.safetensors"}}, "nowhere"),
 ]
-SUBSET = {"tasks": "walker-walk", "levels": "random", "settings": "none", "episodes": 2}
 
 
 @pytest.mark.parametrize(

@@ -124,6 +124,12 @@ def test_a_part_of_a_release_is_called_incomplete(release, name, here, request, 
             Release.open(tmp_path / "part")[other]
 
 
+def test_a_manifest_that_does_not_follow_from_its_recipes_is_no_sound_release(copy):
+    text = (copy / "manifest.json").read_bytes()
+    (copy / "manifest.json").write_bytes(text.replace(b'"right_hip"', b'"left_nose"'))
+    assert [issue.subset for issue in wrong_files(copy)] == ["manifest.json"] and b"right_hip" in text
+
+
 def test_files_that_no_digest_speaks_of_are_named(copy):
     for path in ("preview/sheet.png", "README.md", "card/returns.png"):  # where commands write
         (copy / path).parent.mkdir(exist_ok=True)
