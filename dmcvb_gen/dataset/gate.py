@@ -202,7 +202,7 @@ class Release:
         return f"<Release {self.manifest.name} {self.manifest.version}: {pluralize(len(self.subsets), 'subsets')}>"
 
     def __getstate__(self) -> dict[str, Any]:  # subsets are made again where the release lands
-        return {key: value for key, value in self.__dict__.items() if key != "subsets"}
+        return {key: value for key, value in self.__dict__.items() if key not in ("subsets", "text")}
 
     @property
     def place(self) -> str:

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import zarr
 
-from dmcvb_gen.dataset.manifest import ArraySpec, Layer, SubsetRecord, runs
+from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ListedLayer, SubsetRecord, runs
 from dmcvb_gen.dataset.pictures import picture_of, shown
 from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
@@ -166,7 +166,10 @@ class Subset:
 
     @functools.cached_property
     def _specs(self) -> dict[str, tuple[Layer, ArraySpec]]:
-        return {spec.name: (layer, spec) for layer in self.layers for spec in layer.arrays}
+        # Images that a paint has begun, and of which no shard is here yet, are no part of a finished release.
+        known = (Layer,) if self.release.in_the_making else (ListedLayer,)
+        layers = [layer for layer in self.layers if isinstance(layer, known) or self.release.here(layer.name)]
+        return {spec.name: (layer, spec) for layer in layers for spec in layer.arrays}
 
     @property
     def arrays(self) -> tuple[str, ...]:

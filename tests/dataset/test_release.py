@@ -81,6 +81,8 @@ def test_images_are_added_as_further_layers(store):
     with pytest.raises(StoreError, match="paint"):
         light[NAME].read("pixels")
     assert light[NAME].unpainted.all()
+    begin(store, made_up.recipe(2), {})
+    assert Release.open(store)[NAME].arrays == light[NAME].arrays
     part = made_up.make(store, made_up.recipe(2))[NAME]
     assert len(part) == 5 and list(np.flatnonzero(~part.unpainted)) == [0, 1] and len(part.read("pixels", [0, 1])) == 2
     with pytest.raises(StoreError, match="without images"):
