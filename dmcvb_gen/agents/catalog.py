@@ -118,7 +118,7 @@ def parse_agent(name: str) -> Agent:
         kind = type(defaults.get(key))
         if kind is bool and not value:
             values[key] = True
-        elif kind is int and value.isdigit() and 1 <= int(value) <= MOST:
+        elif kind is int and value.isdecimal() and 1 <= int(value) <= MOST:
             values[key] = int(value)
         else:
             takes = [name if isinstance(default, bool) else f"{name}=1..{MOST}" for name, default in defaults.items()]

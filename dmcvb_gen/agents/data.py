@@ -440,8 +440,10 @@ def load_data(
     """
     subsets = [release[part.subset] for part in slices]
     names = [training_pictures(subset).arrays if subset.pixel_arrays else () for subset in subsets]
-    if len({(subset.task, subset.record.size, len(n)) for subset, n in zip(subsets, names, strict=True)}) != 1:
-        raise DmcvbError(f"cannot mix {', '.join(subset.name for subset in subsets)}: tasks or image sizes differ")
+    alike = {(s.task, s.record.size, s.record.action_repeat, len(n)) for s, n in zip(subsets, names, strict=True)}
+    if len(alike) != 1:
+        mixed = ", ".join(subset.name for subset in subsets)
+        raise DmcvbError(f"cannot mix {mixed}: tasks, image sizes or action repeats differ")
     if pixels and not names[0]:
         raise DmcvbError(f"{subsets[0].name} has no images that agents are trained on")
     split = [choose_episodes(subset, part, seed) for subset, part in zip(subsets, slices, strict=True)]

@@ -46,7 +46,6 @@ from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import replacing, write_json, write_text
 from dmcvb_gen.generate.inputs import video_source
-from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, ignore, open_pool
 from dmcvb_gen.policies.evaluation import goal_scores
@@ -175,6 +174,7 @@ class CellRun:
         self.root, self.out, self.budget, self.cell, self.tick = str(root), Path(out), budget, cell, tick
         self.release = open_data(root, budget)
         self.mark, self.subset = fingerprint(self.release, budget, cell), self.release[cell.policy[0].subset]
+        self._latents: TrainingData | None = None  # of a frozen encoder, for policy and decoders
         # Encoders, and policies whose scores count; DINO's weights are a large file of the user's.
         self.keeps_weights = cell.benchmark == ENCODER or (budget.scores and not cell.agent.sees_by_dino)
 
@@ -306,22 +306,21 @@ class CellRun:
         if self.budget.frozen_shift or draws < len(data.state):
             return data
         dtype = torch.bfloat16 if self.budget.precision == "bfloat16" else torch.float32
-        return data.encoded(encoder, dtype, lambda share: self.tick(f"encoding, {share:.0%}", 0))
+        if data.latent is None and self._latents is None:
+            self._latents = data.encoded(encoder, dtype, lambda share: self.tick(f"encoding, {share:.0%}", 0))
+        return self._latents or data
 
     def _facts(self, data: TrainingData, curve: Curve) -> dict[str, Any]:
         """The facts of a result, without encoder, inspection and time."""
         cell, budget, subset = self.cell, self.budget, self.subset
         evaluations = [point for point in curve if "score" in point]
         best = max(evaluations, key=lambda point: point["score"]["mean"])
-        normal = None
-        if best["score"]["limit"] == subset.record.max_steps:  # returns of other lengths are not compared
-            normal = normalized(best["score"]["mean"], reference_returns(self.release, subset.record))
         like_paper = subset.record.action_repeat == ACTION_REPEAT
         like_paper &= cell.agent.sees_state or subset.record.size == PAPER_SIZE
         paper = BENCHMARKS.get(cell.benchmark).paper_score(cell) if like_paper else None
         return {
             "labels": {"policy": cell.policy_label, "encoder": cell.pretrain_label},
-            "score": best["score"] | {"step": best["step"], "normalized": normal},
+            "score": best["score"] | {"step": best["step"]},
             "final": evaluations[-1]["score"],
             "evaluations": len(evaluations),
             "paper": paper and {"mean": paper[0], "stderr": paper[1]},
@@ -427,6 +426,7 @@ def run_cells(
     Raises:
       StoreError: a worker was killed; finished cells are kept.
     """
+    before = torch.get_num_threads()
     if workers == 1:
         torch.set_num_threads(budget.threads)
     elif isinstance(workers, int):
@@ -440,6 +440,7 @@ def run_cells(
         open_pool(workers, threads=budget.threads, tick=tick, kept=kept, needs=needs) as pool,
         contextlib.ExitStack() as after,
     ):
+        after.callback(torch.set_num_threads, before)
         after.callback(_held.clear)  # pictures that this process held
         share = pool.memory_each()
         if budget.memory is None and share is not None and budget.device == "cpu":

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.inputs import background_source, video_source
 from dmcvb_gen.generate.paint import render_differences
+from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore, in_order, open_pool
 from dmcvb_gen.policies.paper import paper_returns
@@ -128,6 +129,14 @@ def check_pictures(subset: Subset) -> tuple[list[Issue], list[Issue]]:
             if len(frames) > 1 and (flat == flat[:1]).all() and high[0] > 0:
                 odd.append(Issue("pictures", subset.name, f"{name} shows the same frame throughout", episode))
     return found, odd
+
+
+def normalized_score(release: Release, cell: Cell, score: Mapping[str, Any]) -> dict[str, Any]:
+    """A cell's score with its normalized return by what the release has now; None for returns of another length."""
+    record, found = release[cell.policy[0].subset].record, None
+    if score["limit"] == record.max_steps:
+        found = normalized(score["mean"], reference_returns(release, record))
+    return {**score, "normalized": found}
 
 
 def known_returns(release: Release) -> dict[str, np.ndarray]:

@@ -115,21 +115,21 @@ class Cell:
     def id(self) -> str:
         """A file name, different for every cell of a release, whose subsets' names leave out a maze's rows, too."""
         parts = [self.benchmark, spec.task_folder(self.task), self.setting, self.agent.name, self.policy_label]
-        parts += ["from " + "+".join(part.label for part in self.pretrain)] if self.pretrain else []
+        parts += [f"from {self.pretrain_label}"] if self.pretrain else []
         return "_".join(slug(part) for part in parts)
 
     @property
     def policy_label(self) -> str:
-        return "+".join(part.label for part in self.policy)
+        return self._labels(self.policy)
 
     @property
     def pretrain_label(self) -> str:
         """Name the encoder's data, with its setting if that is another one; "" for the policy's data."""
-        labels = []
-        for part in self.pretrain:
-            setting = part.subset.split("/")[-1]
-            labels.append(part.label if setting == self.setting else f"{part.label}, {setting}")
-        return "+".join(labels)
+        return self._labels(self.pretrain)
+
+    def _labels(self, parts: Iterable[Slice]) -> str:
+        settings = [(part.label, part.subset.split("/")[-1]) for part in parts]
+        return "+".join(label if setting == self.setting else f"{label}, {setting}" for label, setting in settings)
 
     @property
     def place(self) -> str:

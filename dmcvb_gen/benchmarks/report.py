@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.trainer import Budget
-from dmcvb_gen.benchmarks.checks import Results, Structure, comparable, known_returns
+from dmcvb_gen.benchmarks.checks import Results, Structure, comparable, known_returns, normalized_score
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, only, paper_score, plan_benchmark
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.environment import environment
@@ -154,6 +154,10 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
         there = json.loads(path.read_text())
     except (OSError, ValueError):
         there = None
+    if there is not None and not (
+        isinstance(there, dict) and {*mine} == {*there} and isinstance(there["budget"], dict)
+    ):
+        raise DmcvbError(f"{path} is no note of a validation; give another --out")
     if there is not None and there != mine:
         names = {f"budget.{name}" for name in mine["budget"] if there["budget"].get(name) != mine["budget"][name]}
         names |= {"release"} if there["release"] != mine["release"] else set()
@@ -219,7 +223,11 @@ def report_facts(
         },
         "cells_planned": planned,
         "failed": failed,
-        "results": [result | compare(cell, results) for cell, result in results if "error" not in result],
+        "results": [
+            result | compare(cell, results) | {"score": normalized_score(release, cell, result["score"])}
+            for cell, result in results
+            if "error" not in result
+        ],
         "comparison": comparison(budget, results),
         "missing": [dataclasses.asdict(entry) for entry in missing],
         "versions": environment(),

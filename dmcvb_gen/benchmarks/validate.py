@@ -115,7 +115,8 @@ def validate(
     data, patterns = open_data(release, budget), as_names(only)
     chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
     if patterns:  # a subset that was not asked for is not missing
-        missing = [one for one in missing if any(matches(name, patterns) for name in one.subsets)]
+        asked = [(one, tuple(each for each in one.subsets if matches(each, patterns))) for one in missing]
+        missing = [dataclasses.replace(one, subsets=subsets) for one, subsets in asked if subsets]
     name = Path(release).resolve().name + "-checks" * checks_only  # a report of trainings stays as it is
     folder = local_path(out or Path("reports") / name)
     claim_folder(folder, data, budget, training=bool(cells))
@@ -154,4 +155,6 @@ def agent_names(agents: Names | None, dino_weights: Location | None) -> list[str
         raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
     if dino_weights is None and needed:
         raise DmcvbError(DinoEncoder.missing)
+    if dino_weights is not None:
+        DinoEncoder.digest(dino_weights)  # read, before any work
     return names

@@ -87,7 +87,12 @@ def _list_settings(as_json, *, task, algo, settings, **_):
 @click.option(
     "--episodes", type=click.IntRange(2), default=100, show_default=True, help="Fresh episodes to score each pick."
 )
-@click.option("--convergence", type=float, metavar="RETURN", help="Return at convergence of another run of the task.")
+@click.option(
+    "--convergence",
+    type=click.FloatRange(-1e9, 1e9),
+    metavar="RETURN",
+    help="Return at convergence of another run of the task.",
+)
 @json_option
 def select_checkpoints(run, episodes, convergence, as_json):
     """Pick the expert, medium and mixed checkpoints of a run.

@@ -4,12 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
+from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
+from dmcvb_gen.distractors.registry import typed_setting
 from dmcvb_gen.generate.inputs import BUILTIN, shown_videos
 from dmcvb_gen.loaders.envs import DistractedEnv, DistractedVectorEnv
 from dmcvb_gen.spec import FIXED
 from dmcvb_gen.tasks import ACTION_REPEAT
+
+OF_THE_SETTING = ("backgrounds", "own_videos", "fixed_goals", "goal_seed")
+"""Options that mean something under the data's own distractor or goal."""
+
+
+def shown_by(record: SubsetRecord, setting: str) -> bool:
+    """Return True if another distractor or goal shows the data's videos, or has its fixed goals."""
+    other = record.model_copy(update={"setting": setting})
+    return setting == FIXED or (other.goal_mode is None and other.distractor.shows_videos)
 
 
 def matching_environment(
@@ -21,6 +32,8 @@ def matching_environment(
         given["backgrounds"] = videos
     if repeat := options.get("action_repeat"):  # the data's time limit, in other steps
         given["max_steps"] = given["max_steps"] * subset.record.action_repeat // repeat
+    if (setting := options.get("distractor")) and not shown_by(subset.record, typed_setting(setting)):
+        given = {name: value for name, value in given.items() if name not in OF_THE_SETTING}
     given |= options
     return DistractedEnv(**given) if num_envs is None else DistractedVectorEnv(num_envs, **given)
 

@@ -96,7 +96,9 @@ class SubsetReader(Subset):
             raise UnknownNameError("kind of data set", kind, kinds)
         made, takes = kinds[kind]
         known = [name for name in inspect.signature(takes).parameters if name not in ("subset", "worker", "workers")]
-        if unknown := options.keys() - known:
+        if kind == "transitions":
+            known.remove("next_step")
+        if unknown := options.keys() - {*known}:
             raise UnknownNameError(f"option of torch({kind!r})", min(unknown), known)
         if kind == "transitions":
             options["next_step"] = True

@@ -64,9 +64,9 @@ class Settings(EpisodeSettings):
       updates_per_step: gradient updates an agent step (all simulations together count `simulations` steps).
       buffer_size: agent steps remembered.
       batch_size: places an update.
-      learning_rate: largest learning rate.
-      ramp: agent steps in which the learning rate rises to `learning_rate`: so that there are checkpoints on the way to
-        an expert, which medium is picked from.
+      learning_rate: learning rate before `ramp` and `half_life` lower it.
+      ramp: agent steps in which the learning rate rises from 0: so that there are checkpoints on the way to an expert,
+        which medium is picked from.
       half_life: agent steps in which the learning rate halves.
       ahead: meters down the way at which the guide points.
       greedy_fraction: share of the simulations in which the student acts by its mean, as data are made.

@@ -186,10 +186,12 @@ class ReturnScale:
         """Return the state that it continues from."""
         return {"norm": self._norm.state(), "largest": self._largest, "running": torch.tensor(self._running)}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state()`."""
+    def load_state(self, state: Mapping[str, Any], running: bool = True) -> None:
+        """Continue from `state()`; with `running` in the same episodes."""
         self._norm.load_state(state["norm"])
-        self._largest, self._running = state["largest"], state["running"].numpy().copy()
+        self._largest = state["largest"]
+        if running:
+            self._running = state["running"].numpy().copy()
 
 
 class RowBuffer:
@@ -526,6 +528,10 @@ class Sac(Learner):
         return {name: float(value) for name, value in self._losses.items()} | {
             "temperature": float(self.log_alpha.detach().exp())
         }
+
+    def load_networks(self, state: Mapping[str, Any]) -> None:
+        super().load_networks(state)
+        self.returns.load_state(state["returns"], running=False)  # critics know rewards on this scale
 
     def state(self) -> dict[str, Any]:
         return super().state() | {"returns": self.returns.state()}

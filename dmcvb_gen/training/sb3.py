@@ -7,12 +7,13 @@ unpickled. Steps of an on-policy algorithm since its last update are not kept.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import inspect
 import re
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import sb3_contrib
@@ -21,6 +22,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecNormalize
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError, UnknownNameError
@@ -33,10 +35,12 @@ from dmcvb_gen.training.vec_env import TaskVecEnv
 ALGORITHMS = ("A2C", "CrossQ", "DDPG", "PPO", "SAC", "TD3", "TQC", "TRPO")
 """Those whose actors for continuous actions are plain MLPs, which policy files hold."""
 NOT_SET = ("self", "policy", "env", "device", "verbose", "seed", "tensorboard_log", "_init_setup_model")
-"""Arguments of an algorithm that the run gives."""
+NOT_SET += ("optimize_memory_usage",)
+"""Arguments of an algorithm that the run gives, or that its saved buffer does not know."""
+
 OURS = {"simulations": 8, "normalize_observation": False, "normalize_reward": False}
 KINDS: dict[Any, Any] = {bool: bool, int: Count, float: NonNegative, str: float | str}
-KINDS |= {"gradient_steps": int, "learning_starts": Natural, "top_quantiles_to_drop_per_net": Natural}
+KINDS |= {"gradient_steps": Literal[-1] | Count, "learning_starts": Natural, "top_quantiles_to_drop_per_net": Natural}
 KINDS |= dict.fromkeys(("action_noise", "clip_range_vf", "target_kl"), NonNegative | None)
 """Argument, or the type of its default -> what it may be."""
 MEANINGS = """Settings of an algorithm of SB3.
@@ -88,12 +92,15 @@ def check(run: Run) -> None:
         raise DmcvbError(f"--init-from has no effect with --algo {run.config.algorithm}: remove it")
     model = make_model(run)
     export(run, model)
-    simulations, starts = run.settings.simulations, getattr(model, "learning_starts", None)
-    first = model.n_steps * simulations if starts is None else starts // simulations * simulations + simulations
+    simulations, starts = run.settings.simulations, getattr(model, "learning_starts", 0)
+    frequency = getattr(model, "train_freq", None)  # of an algorithm with a replay buffer
+    each = simulations * (model.n_steps if frequency is None else frequency.frequency)
+    each *= run.task.max_steps if frequency and frequency.unit is TrainFrequencyUnit.EPISODE else 1
+    first = each if frequency is None else starts // each * each + each
     if run.config.steps <= first:  # SB3 learns after a step that is not the last one
         raise DmcvbError(
             f"{run.config.algorithm} learns from step {first:,} on, and {run.config.steps:,} are asked for; give more "
-            "--steps, or less n_steps or learning_starts with --set"
+            "--steps, or less n_steps, train_freq or learning_starts with --set"
         )
 
 
@@ -103,7 +110,7 @@ def make_model(run: Run) -> BaseAlgorithm:
     Raises:
       DmcvbError: SB3 does not accept the settings.
     """
-    given = {name: value for name, value in vars(run.settings).items() if name not in OURS}
+    given = {name: copy.deepcopy(value) for name, value in vars(run.settings).items() if name not in OURS}  # SB3 writes
     if isinstance(noise := given.get("action_noise"), int | float):
         given["action_noise"] = NormalActionNoise(np.zeros(run.task.action_size), np.full(run.task.action_size, noise))
     seed = run.config.seed
@@ -112,7 +119,7 @@ def make_model(run: Run) -> BaseAlgorithm:
     env: Any = TaskVecEnv(run.task, run.settings.simulations, seed)
     if run.settings.normalize_observation or run.settings.normalize_reward:
         norms = {"norm_obs": run.settings.normalize_observation, "norm_reward": run.settings.normalize_reward}
-        env = VecNormalize(env, **norms)
+        env = VecNormalize(env, **norms, gamma=given["gamma"])
     try:
         model = algorithm_class(run.config.algorithm)("MlpPolicy", env, seed=seed, device="cpu", **given)
     except Exception as error:  # SB3's, torch's and numpy's own kinds
@@ -165,6 +172,7 @@ def restore(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
         for name, value in saved["buffer"].items():
             getattr(model.replay_buffer, name)[: len(value)] = value.numpy()
         model.replay_buffer.pos, model.replay_buffer.full = saved["position"], saved["full"]
+        model.replay_buffer.timeouts[saved["position"] - 1] = True  # episodes begin anew
     model.num_timesteps, model._n_updates = saved["step"], saved["updates"]
 
 
