@@ -393,7 +393,8 @@ def _scores(benchmark: str, facts: Mapping[str, Any]) -> dict[str, Any]:
         cell = result["cell"]
         key = (task_folder(cell["task"]), result["labels"]["policy"], cell["setting"])
         data[key] = [_number(result["data"]["mean"]), *_goal_lines(result["data"])]
-        scores[key][cell["agent"]] = lines = _score_lines(result, facts["budget"])
+        lines = _score_lines(result, facts["budget"])
+        scores[key][cell["agent"]] = scores[key].get(cell["agent"], []) + lines  # of each encoder
         if parse_agent(cell["agent"]).sees_state:
             by_state[key[:2]][cell["agent"]] = lines
     rows = []

@@ -81,6 +81,13 @@ def planned(benchmark, *names, agents=(), **facts):
     return found, {name for one in missing for name in one.subsets}
 
 
+def test_cells_whose_encoders_learned_under_other_settings_have_other_names():
+    parts = [(Slice(f"walker-walk/random/{setting}"),) for setting in ("none", "dynamic")]
+    cells = [Cell("b1", "walker-walk", "none", parse_agent("id+bc"), parts[0], part) for part in parts]
+    cells += [Cell("b1", "walker-walk", "none", parse_agent("bc"), part) for part in parts]
+    assert len({cell.id for cell in cells}) == 4
+
+
 def test_b1_has_every_agent_on_every_set_and_states_once():
     found, missing = planned("b1", *WALKER)
     levels = ("expert", "medium", "mixed", "random", "expert+medium")

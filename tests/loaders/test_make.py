@@ -66,6 +66,7 @@ def test_a_policy_is_scored_as_its_data_are_and_normalized_by_them(levels):
 def test_what_cannot_be_made_or_scored_is_refused_in_a_line(levels, small_mazes):
     folder, (random, _) = levels
     fixed = dmcvb_gen.open(small_mazes)["ant-maze-tiny/random/fixed"]
+    assert fixed.environment(distractor="visible").unwrapped._stage.pairs is None
     for call, words in (
         (lambda: dmcvb_gen.make("walker-walk"), "'walker-walk' names no subset; give TASK/LEVEL/SETTING"),
         (lambda: dmcvb_gen.make(random, levels="expert"), "make\\(\\) decides levels by the name"),

@@ -116,6 +116,8 @@ POLICY = str(bundled_policies("walker-walk", "expert")[0])
             "learns from step 16,384 on, and 1,600 are asked for",
         ),
         (["walker-walk", "--algo", "sb3:SAC", "--steps", "104"], "learns from step 104 on, and 104 are asked for"),
+        (["walker-walk", "--algo", "sb3:SAC", "--steps", "400", "--set", "train_freq=99"], "learns from step 792 on"),
+        (["walker-walk", "--algo", "sb3:SAC", "--set", "optimize_memory_usage=true"], "unknown setting of sb3:SAC"),
         (["walker-walk", "--set", "foo=1"], "more; --list-settings lists them all."),
         (["walker-walk", "--set", "speed"], "key=value"),
         (["walker-walk", "--set", "discount=1.5"], "setting discount of sac is 1.5: input should be less than 1"),

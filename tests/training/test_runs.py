@@ -24,7 +24,8 @@ from dmcvb_gen.training import run as runs
 from dmcvb_gen.training.behaviour import run_config, train_behaviour
 from dmcvb_gen.training.episodes import standing_states
 from dmcvb_gen.training.networks import Actor, as_arrays
-from dmcvb_gen.training.run import LOG, Run, RunConfig, Stopped, check_same, open_run, read_rows
+from dmcvb_gen.training.run import LOG, Run, RunConfig, Stopped, check_same, open_run, read_rows, start_from
+from dmcvb_gen.training.sac import Sac
 from dmcvb_gen.training.settings import default_run
 from tests.faults.inject import files_up_to
 
@@ -197,7 +198,11 @@ def test_checkpoints_whose_saved_state_is_gone_are_not_written_over(tmp_path):
 @pytest.mark.parametrize("case", ["sac", "guided"])
 def test_a_run_goes_on_when_what_it_started_from_is_gone(case, tmp_path):
     if case == "sac":
-        source = train(tmp_path / "first", steps=80).folder
+        first = train(tmp_path / "first", steps=80)
+        source, fresh = first.folder, Sac(first.header, first.settings, 1)
+        start_from(fresh, open_run(tmp_path / "x", config(init_from=str(source)), False))
+        known = first.saved()["learner"]["returns"]  # critics know rewards on this scale
+        assert fresh.returns.state()["norm"]["count"] == known["norm"]["count"] > 1
     else:
         source = shutil.copy(bundled_policies("ant-maze-empty7x7", "expert")[0], tmp_path / "guide.safetensors")
     given = dict(case=case, init_from=str(source))

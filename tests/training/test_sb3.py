@@ -24,6 +24,7 @@ TINY = {
     "sb3:TD3": dict(learning_starts=24, batch_size=16, action_noise=0.3),
     "sb3:PPO": dict(n_steps=5, batch_size=20, n_epochs=2, normalize_observation=True, normalize_reward=True),
     "sb3:TRPO": dict(n_steps=5, batch_size=20),
+    "sb3:A2C": dict(policy_kwargs=NET, normalize_reward=True, gamma=0.9),
 }
 
 
@@ -54,7 +55,8 @@ def test_an_exported_policy_acts_as_the_model_it_comes_from(tmp_path, models, mo
     seen = env.normalize_obs(observation) if isinstance(env, VecNormalize) else observation
     wanted, _ = model.predict(seen, deterministic=True)
     np.testing.assert_allclose(policy.act(observation, deterministic=True), wanted, atol=2e-5)
-    header = policy.header
+    header, kwargs = policy.header, TINY[algorithm].get("policy_kwargs", {})
+    assert run.settings.policy_kwargs in (None, kwargs) and getattr(env, "gamma", model.gamma) == model.gamma
     assert header.algorithm == algorithm and header.evaluation.episodes >= 1 and f"--algo {algorithm}" in header.command
     assert algorithm.removeprefix("sb3:") in origin_of(header.algorithm)
 
