@@ -346,8 +346,11 @@ def _check_tree(subsets: tuple[SubsetRecord, ...], layers: Iterable[Layer]) -> N
     for subset in subsets:
         if lacking := [name for name in subset.layers if name not in named]:
             raise ValueError(f"{subset.name} names layer {lacking[0]}, which is not described")
-        if named[subset.layers[0]].kind != "trajectories":
+        kinds = [named[name].kind for name in subset.layers]
+        if kinds[0] != "trajectories":
             raise ValueError(f"the first layer of {subset.name} holds no trajectories")
+        if not subset.imported and (kinds[1:2] != ["labels"] or "name" not in subset.renderer):
+            raise ValueError(f"{subset.name} has no labels, or no renderer")
 
 
 SAID = ("name", "version", "license", "authors", "description")
@@ -365,6 +368,13 @@ class _Described(_Model):
     description: str = pydantic.Field(default="", max_length=10_000)
     inputs: tuple[FileRecord, ...] = pydantic.Field(default=(), max_length=10**6)
     subsets: tuple[SubsetRecord, ...] = pydantic.Field(max_length=MAX_SHARDS)
+
+    @pydantic.field_validator("inputs")
+    @classmethod
+    def _in_their_folders(cls, inputs: tuple[FileRecord, ...]) -> tuple[FileRecord, ...]:
+        if strange := [file.path for file in inputs if not file.path.startswith((POLICIES, VIDEOS))]:
+            raise ValueError(f"{strange[0]} is no policy and no video")
+        return inputs
 
     @property
     def imported(self) -> bool:

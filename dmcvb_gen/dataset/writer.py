@@ -126,11 +126,12 @@ def begin(store: Store, recipe: Resolved, inputs: Mapping[str, Path | bytes]) ->
                 "(--backgrounds FOLDER)"
             )
         put(store, file.path, inputs[file.path])
-    put(store, path := f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe))
+    created = store.create(path := f"{RECIPES}{recipe.sha256}.json", canonical_json(recipe))
     try:
         check_agree(read_recipes(store))
     except StoreError:  # another process began meanwhile
-        store.delete(path)
+        if created:
+            store.delete(path)
         raise
 
 

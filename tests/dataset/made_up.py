@@ -69,6 +69,7 @@ def recipe(episodes: int, settings: Sequence[str] = ("none", "dynamic"), images:
                 layers=(TRAJECTORIES.name, *[layer.name for layer in own]),
                 size=SIZE,
                 max_steps=MAX_STEPS,
+                renderer={"name": "native"},
             )
         )
     facts = {"name": "hop", "version": "1.0.0", "license": "CC-BY-4.0"} | fields

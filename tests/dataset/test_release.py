@@ -104,8 +104,8 @@ def test_images_that_are_added_after_a_growth_are_listed(store):
 
 
 def test_what_was_painted_first_is_the_release_that_is_made_at_once(store, tmp_path):
-    at_once = made_up.recipe(5).model_copy(update={"recipe": {"name": "hop"}})  # `paint` writes none
-    made_up.make(store, made_up.recipe(5))
+    at_once = made_up.recipe(5)
+    made_up.make(store, at_once.model_copy(update={"recipe": {}}))  # as `paint` writes it
     assert made_up.make(store, at_once).digest == made_up.make(open_store(tmp_path / "other"), at_once).digest
 
 
