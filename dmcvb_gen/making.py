@@ -12,18 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from annotated_types import Ge, Gt, Lt
 
 from dmcvb_gen.errors import DmcvbError, StoreError
-from dmcvb_gen.options import (
-    Count,
-    Local,
-    Location,
-    Names,
-    Samples,
-    Seed,
-    Span,
-    Split,
-    checked,
-    progress_bar,
-)
+from dmcvb_gen.options import Count, Local, Location, Names, Samples, Seed, Span, Split, checked, progress_bar
 from dmcvb_gen.parallel import Workers
 from dmcvb_gen.spec import SubsetSpec, is_maze, subset_name
 from dmcvb_gen.text import as_names, quoted

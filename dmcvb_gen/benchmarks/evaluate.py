@@ -247,11 +247,7 @@ class Evaluator:
                 break
         success, speed = goal_scores(task, start, length, ended)
         return Score.of(
-            returns,
-            success=success,
-            speed=speed,
-            limit=self.steps,
-            pictures=np.stack(pictures) if pictures else None,
+            returns, success=success, speed=speed, limit=self.steps, pictures=np.stack(pictures) if pictures else None
         )
 
     def _walk(self) -> DistractorSampler | None:

@@ -7,11 +7,7 @@ import textwrap
 import click
 
 from dmcvb_gen import making
-from dmcvb_gen.cli.common import (
-    json_option,
-    print_json,
-    print_table,
-)
+from dmcvb_gen.cli.common import json_option, print_json, print_table
 from dmcvb_gen.cli.options import command_of
 from dmcvb_gen.storage.places import is_url, shown, unpinned
 from dmcvb_gen.text import format_bytes, pluralize, quoted

@@ -183,10 +183,7 @@ def split_names(flag: str, text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-FORMATS: dict[str | None, Callable[[str, str], Any]] = {
-    "A:B": parse_range,
-    "A,B": split_names,
-}
+FORMATS: dict[str | None, Callable[[str, str], Any]] = {"A:B": parse_range, "A,B": split_names}
 """Metavar -> function that reads the value of a flag."""
 
 

@@ -25,14 +25,7 @@ from dmcvb_gen.dataset.writer import file_facts, put, put_back, put_record, read
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
-from dmcvb_gen.generate.render import (
-    distractor_state_of,
-    label_arrays,
-    paint,
-    paint_labels,
-    renderers,
-    videos_of,
-)
+from dmcvb_gen.generate.render import distractor_state_of, label_arrays, paint, paint_labels, renderers, videos_of
 from dmcvb_gen.generate.resolve import code_of_distractor, code_of_task
 from dmcvb_gen.generate.works import Setting, Work
 from dmcvb_gen.parallel import ProgressCallback, ignore

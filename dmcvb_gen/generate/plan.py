@@ -139,11 +139,7 @@ def start(plan: Plan, other_versions: bool = False, command: str = "rollout") ->
 
 
 def run_plan(
-    plan: Plan,
-    workers: Workers | None = None,
-    progress: ProgressCallback = ignore,
-    *,
-    finishing: bool = True,
+    plan: Plan, workers: Workers | None = None, progress: ProgressCallback = ignore, *, finishing: bool = True
 ) -> tuple[Release, int]:
     """Make every shard of a plan, and write the manifest of subsets that are whole.
 

@@ -18,15 +18,7 @@ from dmcvb_gen.generate.recipe import (
     override,
 )
 from dmcvb_gen.own_code import BEHAVIOURS, allow, is_own, refuse_file
-from dmcvb_gen.spec import (
-    FIXED,
-    GOAL_MODES,
-    VISIBLE,
-    DistractorSetting,
-    Level,
-    is_maze,
-    task_folder,
-)
+from dmcvb_gen.spec import FIXED, GOAL_MODES, VISIBLE, DistractorSetting, Level, is_maze, task_folder
 from dmcvb_gen.tasks import get_task, typed_task
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.text import as_names

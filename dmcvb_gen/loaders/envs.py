@@ -28,12 +28,7 @@ from dmcvb_gen.generate.render import check_renderer, look, open_renderer
 from dmcvb_gen.generate.request import background_source
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
-from dmcvb_gen.spec import (
-    VISIBLE,
-    GoalMode,
-    SubsetSpec,
-    is_maze,
-)
+from dmcvb_gen.spec import VISIBLE, GoalMode, SubsetSpec, is_maze
 from dmcvb_gen.tasks import Task, get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.text import as_names

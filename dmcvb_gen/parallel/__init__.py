@@ -16,17 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-from dmcvb_gen.parallel.base import (
-    KEPT,
-    Needs,
-    Pool,
-    ProgressCallback,
-    Ray,
-    SerialPool,
-    Workers,
-    expect,
-    ignore,
-)
+from dmcvb_gen.parallel.base import KEPT, Needs, Pool, ProgressCallback, Ray, SerialPool, Workers, expect, ignore
 
 __all__ = [
     "Needs",

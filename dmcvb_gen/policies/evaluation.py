@@ -14,13 +14,7 @@ FRESH = "selection"
 """Streams of the episodes that decide which checkpoint is picked: a training's evaluations see none of them."""
 
 
-def evaluate(
-    policy: Policy,
-    task: Task,
-    episodes: int = 100,
-    seed: int = 1,
-    streams: str = "evaluation",
-) -> Evaluation:
+def evaluate(policy: Policy, task: Task, episodes: int = 100, seed: int = 1, streams: str = "evaluation") -> Evaluation:
     """Roll a policy out over fresh episodes (streams of their own, apart from every release's).
 
     Args:

@@ -31,9 +31,4 @@ def available_renderers() -> dict[str, str | None]:
     return {name: None if name == "native" else renderer_class(name).unavailable() for name in RENDERERS}
 
 
-__all__ = [
-    "RENDERERS",
-    "Renderer",
-    "available_renderers",
-    "renderer_class",
-]
+__all__ = ["RENDERERS", "Renderer", "available_renderers", "renderer_class"]

@@ -17,14 +17,7 @@ from dmcvb_gen.errors import LayoutError
 from dmcvb_gen.tasks import get_task, typed_task
 from dmcvb_gen.tasks.ant_maze import ANT_MAZE_TASKS, LAYOUTS, fixed_pairs
 from dmcvb_gen.tasks.ant_maze.arena import WALL_HEIGHT, look_numbers
-from dmcvb_gen.tasks.ant_maze.distance import (
-    PIXELS,
-    blend,
-    floor_of,
-    geodesic_field,
-    look_up,
-    saturated_field,
-)
+from dmcvb_gen.tasks.ant_maze.distance import PIXELS, blend, floor_of, geodesic_field, look_up, saturated_field
 from dmcvb_gen.tasks.ant_maze.layouts import CELL, get_layout, make_layout
 from dmcvb_gen.tasks.ant_maze.task import BEHAVIOUR_FIELDS, FIELDS
 from dmcvb_gen.tasks.ant_maze.waypoints import headings

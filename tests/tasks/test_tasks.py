@@ -58,8 +58,7 @@ def actions_of(kind, rng, size):
 
 
 @pytest.mark.parametrize(
-    "kind, repeat",
-    [("random", 4), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
+    "kind, repeat", [("random", 4), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
 )
 @pytest.mark.parametrize("task_id", LOCOMOTION_TASKS)
 def test_a_whole_episode_agrees_with_dm_control(task_id, kind, repeat):

@@ -93,10 +93,7 @@ def export(
         stamp = _stamp(source[name], to, episodes)
         works.append(_Work(path, storage_options, to, name, episodes, folder / kind.folder_name(name), stamp))
     todo = [work for work in works if not work.done]
-    with (
-        progress_bar(progress, " episodes", scaled=False) as bar,
-        open_pool(workers, tick=bar, most=len(todo)) as pool,
-    ):
+    with progress_bar(progress, " episodes", scaled=False) as bar, open_pool(workers, tick=bar, most=len(todo)) as pool:
         expect(bar, sum(len(work.episodes) for work in todo))
         for work in todo:
             pool.submit(work.folder, _write, work)

@@ -66,10 +66,7 @@ def write(source: Source, folder: Path) -> None:
 
 
 def _dict(features: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "pythonClassName": f"{_FEATURES}.features_dict.FeaturesDict",
-        "featuresDict": {"features": features},
-    }
+    return {"pythonClassName": f"{_FEATURES}.features_dict.FeaturesDict", "featuresDict": {"features": features}}
 
 
 def _tensor(dtype: str, *shape: int) -> dict[str, Any]:
