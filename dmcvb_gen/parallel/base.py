@@ -38,11 +38,18 @@ class Pool(abc.ABC):
     `submit(key, function, *arguments)` has `function(*arguments, tick=...)` run; `results()` gives (key, result) as
     they come, until nothing is left of what was submitted, then or meanwhile. The first exception of a function is
     raised by `results()`.
+
+    Args:
+      tick: called with what the functions report.
     """
 
-    @abc.abstractmethod
+    def __init__(self, tick: ProgressCallback = ignore):
+        self._tick = tick
+        self._waiting: deque[tuple[Any, Callable, tuple]] = deque()
+
     def submit(self, key: Any, function: Callable, *arguments: Any) -> None:
         """Have `function(*arguments, tick=...)` run; `key` comes back with its result."""
+        self._waiting.append((key, function, arguments))
 
     @abc.abstractmethod
     def results(self) -> Iterator[tuple[Any, Any]]:
@@ -68,13 +75,6 @@ class Pool(abc.ABC):
 
 class SerialPool(Pool):
     """Pool that runs its work in this process, one piece after another, when results are asked for."""
-
-    def __init__(self, tick: ProgressCallback = ignore):
-        self._tick = tick
-        self._waiting: deque[tuple[Any, Callable, tuple]] = deque()
-
-    def submit(self, key, function, *arguments):
-        self._waiting.append((key, function, arguments))
 
     def results(self):
         while self._waiting:

@@ -12,7 +12,6 @@ import sys
 import threading
 import traceback
 import types
-from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -38,14 +37,11 @@ class ProcessPool(Pool):
 
     def __init__(self, workers: int, threads: int = 1, tick: ProgressCallback = ignore, kept: str = KEPT):
         context = multiprocessing.get_context("spawn")
-        self._workers, self._tick, self._kept = workers, tick, kept
+        super().__init__(tick)
+        self._workers, self._kept = workers, kept
         self._messages = context.Queue()
         self._pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(self._messages, threads))
-        self._waiting: deque = deque()
         self._running: dict[Future, Any] = {}
-
-    def submit(self, key, function, *arguments):
-        self._waiting.append((key, function, arguments))
 
     def results(self):
         try:

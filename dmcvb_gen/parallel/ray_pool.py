@@ -10,7 +10,6 @@ import dataclasses
 import logging
 import os
 import socket
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,7 +38,8 @@ class RayPool(Pool):
             import ray
         except ImportError:
             raise DmcvbError("--workers ray needs a package that is not installed: pip install 'ray>=2.40'") from None
-        self._ray, self._tick, self._needs, self._threads = ray, tick, needs or Needs(), threads
+        super().__init__(tick)
+        self._ray, self._needs, self._threads = ray, needs or Needs(), threads
         self._ours = not ray.is_initialized()
         if self._ours:
             _check_answers(address or os.environ.get("RAY_ADDRESS"))
@@ -48,11 +48,7 @@ class RayPool(Pool):
             except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
                 reason = " ".join(str(error).split())[:200]
                 raise _nobody(address or "RAY_ADDRESS", reason) from None
-        self._waiting: deque = deque()
         self._running: dict[Any, Any] = {}
-
-    def submit(self, key, function, *arguments):
-        self._waiting.append((key, function, arguments))
 
     def results(self):
         ray, needs = self._ray, self._needs
