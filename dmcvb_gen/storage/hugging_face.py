@@ -148,8 +148,7 @@ class HubStore(Store):
             for first in range(0, len(todo), BATCH):
                 batch = todo[first : first + BATCH]
                 adds = [CommitOperationAdd(self.folder_there + path, str(root / path)) for path in batch]
-                message = f"files {first + 1} to {first + len(batch)} of {len(todo)}"
-                self._made(self._api.create_commit(**self._where, operations=adds, commit_message=message))
+                self._commit(adds, f"files {first + 1} to {first + len(batch)} of {len(todo)}")
                 tick(len(batch))
         return [path for path in paths if path in there]
 
@@ -157,8 +156,7 @@ class HubStore(Store):
         from huggingface_hub import CommitOperationDelete
 
         if path in self._known([path], self._head()):
-            gone = [CommitOperationDelete(self.folder_there + path)]
-            self._made(self._api.create_commit(**self._where, operations=gone, commit_message=f"remove {path}"))
+            self._commit([CommitOperationDelete(self.folder_there + path)], f"remove {path}")
 
     def finish(self, contents: Mapping[str, bytes], expected: str | None = ANY) -> bool:
         """In one commit, which the Hub refuses if another one has come since the version was compared."""
@@ -171,12 +169,13 @@ class HubStore(Store):
             if expected not in (ANY, now[last].blob_id if last in now else None):
                 return last in now and now[last].blob_id == _blob(contents[last])
             adds = [CommitOperationAdd(self.folder_there + path, data) for path, data in contents.items()]
-            given = {"operations": adds, "commit_message": ", ".join(contents), "parent_commit": head}
-            self._made(self._api.create_commit(**self._where, **given))
+            self._commit(adds, ", ".join(contents), parent_commit=head)
         return True
 
-    def _made(self, commit: Any) -> None:
-        self._commits["read"] = commit.oid
+    def _commit(self, operations: Sequence[Any], message: str, **given: Any) -> None:
+        """Make a commit, which is the one that is read from then on."""
+        given |= {"operations": operations, "commit_message": message}
+        self._commits["read"] = self._api.create_commit(**self._where, **given).oid
 
     def tag(self, name: str, message: str) -> None:
         """`name`, after the release's folder if it has one in the repository."""
