@@ -42,6 +42,11 @@ class UnknownNameError(DmcvbError, KeyError):
         return copyreg.__newobj__, (type(self), *self.args)  # type: ignore[attr-defined]  # typeshed lacks it
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says; the name of its kind if it says nothing."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 class PolicyFileError(DmcvbError):
     """A policy file that cannot be trusted or does not fit the task."""
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, first_line
 
 TASKS = "DMCVB_GEN_TASKS"
 BEHAVIOURS = "DMCVB_GEN_BEHAVIOURS"
@@ -134,6 +134,5 @@ def _import(module: str, what: str, function: str | None = None) -> ModuleType:
     except ImportError as error:
         reason = str(error)
     except Exception as error:  # the user's code
-        reason = (str(error).splitlines() or [""])[0]
-        raise DmcvbError(f"{what} cannot be imported ({type(error).__name__}: {reason})") from error
+        raise DmcvbError(f"{what} cannot be imported ({type(error).__name__}: {first_line(error)})") from error
     raise DmcvbError(f"cannot find {what} ({reason}); give {form}, run from its folder")

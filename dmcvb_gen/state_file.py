@@ -14,7 +14,7 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, first_line
 
 STATE = "state.safetensors"
 """The file's name in a run's `resume` folder."""
@@ -61,8 +61,7 @@ def read_state_file(path: str | Path, otherwise: str) -> Any:
         with safe_open(path, framework="pt") as file:
             return _value(json.loads((file.metadata() or {})["state"]), file)
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DmcvbError(f"{path} cannot be read ({reason}); {otherwise}") from None
+        raise DmcvbError(f"{path} cannot be read ({first_line(error)}); {otherwise}") from None
 
 
 def _value(tree: Any, file: Any) -> Any:

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from torch import nn
 
 from dmcvb_gen.agents.learners import register_agent
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.files import sha256_file
 
@@ -82,8 +82,8 @@ class DinoEncoder(nn.Module):
         except (OSError, SafetensorError) as error:
             raise DmcvbError(f"cannot read DINO weights {weights} ({error}); give a safetensors file") from None
         except (KeyError, ValueError, RuntimeError) as error:
-            reason = str(error).splitlines()[0]
-            raise DmcvbError(f"{weights} does not hold the weights of a DINO vision transformer ({reason})") from None
+            what = f"{weights} does not hold the weights of a DINO vision transformer"
+            raise DmcvbError(f"{what} ({first_line(error)})") from None
         vit.reset_classifier(0)
         return cls(vit.float().eval().requires_grad_(False), channels)
 

@@ -43,7 +43,7 @@ from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.distractors import load_backgrounds
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.files import replacing, write_json, write_text
 from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
@@ -472,8 +472,7 @@ def try_cell(
     except Exception as error:  # one cell's bug or lack of memory must not cost the hours of the others
         with contextlib.suppress(OSError):  # of a full disk, about which the error is
             write_text(log, traceback.format_exc())
-        first = (str(error).splitlines() or [""])[0]
-        return {"error": f"{type(error).__name__}: {first} (all of it in {log})"}
+        return {"error": f"{type(error).__name__}: {first_line(error)} (all of it in {log})"}
     log.unlink(missing_ok=True)
     return result
 

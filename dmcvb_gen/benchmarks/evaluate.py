@@ -25,7 +25,7 @@ from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.manifest import MAX_STEPS
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
 from dmcvb_gen.distractors import DistractorSampler
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.files import replacing
 from dmcvb_gen.generate.inputs import BUILTIN, shown_videos
 from dmcvb_gen.generate.recipe import NATIVE
@@ -528,8 +528,7 @@ def load_agent(path: str | Path) -> TrainedAgent:
         policy.half = bool(facts["half"])
         return TrainedAgent(agent, sizes, policy.eval(), normalization, dict(facts.get("evaluation", {})))
     except (OSError, SafetensorError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-        reason = str(error).splitlines()[0]
-        raise DmcvbError(f"{path} is no agent that validate trained ({reason})") from None
+        raise DmcvbError(f"{path} is no agent that validate trained ({first_line(error)})") from None
 
 
 def _untrained(agent: Agent, sizes: Sizes, network: Architecture) -> Policy:

@@ -16,7 +16,7 @@ from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES, OPTIONAL_
 from dmcvb_gen.distractors.backgrounds import Backgrounds, load_backgrounds
 from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene, floor_alpha_for
 from dmcvb_gen.distractors.registry import BUILT_IN, distractors_of
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.tasks.base import Task
 
 ROUNDING = 1e-4
@@ -86,8 +86,7 @@ class DistractorSampler:
         except Exception as error:
             if not self.own or isinstance(error, DmcvbError):
                 raise
-            reason = (str(error).splitlines() or [""])[0]
-            raise DmcvbError(f"distractor {self.own} failed ({type(error).__name__}: {reason})") from error
+            raise DmcvbError(f"distractor {self.own} failed ({type(error).__name__}: {first_line(error)})") from error
 
     def _check(self, found: dict[str, Any], lead: tuple[int, ...]) -> None:
         """Refuse labels that cannot be stored, or that no picture shows.

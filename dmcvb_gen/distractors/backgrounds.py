@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageSequence
 
-from dmcvb_gen.errors import BackgroundError
+from dmcvb_gen.errors import BackgroundError, first_line
 
 FRAME_SIZE = 256
 """Frames are cut to their central square and resized to this many pixels a side (Kubric MOVi-D's size)."""
@@ -192,8 +192,8 @@ def _decode(files: tuple[Path, ...]) -> np.ndarray:
         except ModuleNotFoundError:  # the command says what to install
             raise
         except Exception as error:  # decoders raise many kinds; all mean the same to the user
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise BackgroundError(f"cannot read background {path} ({reason}); remove or replace the file") from None
+            what = f"cannot read background {path} ({first_line(error)})"
+            raise BackgroundError(f"{what}; remove or replace the file") from None
         count += len(parts[-1])
         if count >= MAX_FRAMES:
             break

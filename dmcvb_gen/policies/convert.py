@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pydantic
 
-from dmcvb_gen.errors import PolicyFileError
+from dmcvb_gen.errors import PolicyFileError, first_line
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.policy_file import check_weights, load_policy, save_policy
@@ -223,7 +223,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
     except OSError as error:
         raise PolicyFileError(f"cannot read {path}: {error.strerror or error}; give the path of a policy") from None
     except Exception as error:  # torch's own kinds, pickle's and zip's
-        reason = (str(error).splitlines() or [type(error).__name__])[0].split(". ")[0][:120]
+        reason = first_line(error).split(". ")[0][:120]
         raise PolicyFileError(
             f"{path} holds no weights that can be read without running code ({reason}); save its state dict with "
             "torch.save(actor.state_dict(), ...)"
@@ -364,8 +364,7 @@ def _normalization(statistics: str | Path | None, size: int) -> dict[str, np.nda
         with np.load(statistics, allow_pickle=False) as file, np.errstate(over="ignore"):  # check_weights refuses inf
             return {f"observation_{name}": np.asarray(file[name], np.float32).reshape(size) for name in ("mean", "std")}
     except Exception as error:  # numpy's, zip's and zlib's own kinds, and those of a single array
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise PolicyFileError(
-            f'{statistics} has no "mean" and "std" of {size} observations ({reason}); write it with '
+            f'{statistics} has no "mean" and "std" of {size} observations ({first_line(error)}); write it with '
             "numpy.savez(file, mean=..., std=...)"
         ) from None

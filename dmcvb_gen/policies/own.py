@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from dmcvb_gen.errors import PolicyFileError
+from dmcvb_gen.errors import PolicyFileError, first_line
 from dmcvb_gen.own_code import BEHAVIOURS, find_function, source_digest
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
@@ -107,8 +107,8 @@ class OwnPolicy(Policy):
         try:
             action = np.asarray(self._function(np.array(observation, np.float32), RowGenerator(generators)))
         except Exception as error:  # the user's code
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise PolicyFileError(f"behaviour {self._name} failed ({type(error).__name__}: {reason})") from error
+            told = f"behaviour {self._name} failed ({type(error).__name__}: {first_line(error)})"
+            raise PolicyFileError(told) from error
         if action.shape != asked or action.dtype.kind not in "fiu":
             raise PolicyFileError(
                 f"behaviour {self._name} gave {action.dtype} of shape {action.shape}, {self.header.task} takes numbers "

@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_safetensors
 from safetensors.numpy import save as dump_safetensors
 
-from dmcvb_gen.errors import PolicyFileError
+from dmcvb_gen.errors import PolicyFileError, first_line
 from dmcvb_gen.files import parse_json, write_bytes
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.actor import Policy
@@ -59,7 +59,7 @@ def _read(path: Path) -> tuple[PolicyHeader, dict[str, np.ndarray], str]:
         header = PolicyHeader.model_validate_json(metadata["header"])
         weights = load_safetensors(data)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = first_line(error)
         if isinstance(error, pydantic.ValidationError):
             first = error.errors()[0]
             reason = f"header field {'.'.join(map(str, first['loc']))}: {first['msg']}"
