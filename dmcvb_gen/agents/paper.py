@@ -116,14 +116,7 @@ class StatePrediction(Learner):
         return {"loss": F.mse_loss(self.h(self.encoder(batch.observation)).float(), batch.state)}
 
 
-# -- what a frozen encoder still knows (section 5.1) ---------------------------------------------------------
-
-
-class ObservationProbe(Autoencoder):
-    """|| psi(phi(o)) - o ||^2 over psi, phi frozen."""
-
-    def __init__(self, encoder: nn.Module, sizes: Sizes, architecture: Architecture = PAPER):
-        super().__init__(encoder.requires_grad_(False), sizes, architecture)
+# -- what a frozen encoder still knows (section 5.1), beside an autoencoder on it -----------------------------
 
 
 class StateProbe(Learner):

@@ -35,7 +35,7 @@ from dmcvb_gen.agents.catalog import Agent, make_encoder, make_policy, make_pret
 from dmcvb_gen.agents.data import TrainingData, default_memory, labeled_episodes, load_data
 from dmcvb_gen.agents.dino import DinoEncoder
 from dmcvb_gen.agents.learners import Learner, Policy
-from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
+from dmcvb_gen.agents.paper import Autoencoder, StateProbe
 from dmcvb_gen.agents.probe import action_probe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
 from dmcvb_gen.benchmarks.evaluate import SPLIT, Evaluator, Score, TrainedAgent, evaluation_steps, renderer_choice
@@ -341,7 +341,7 @@ class CellRun:
         budget, steps = self.budget, self.budget.readout_steps
         torch.manual_seed(budget.seed)
         readouts = {
-            "observation": ObservationProbe(encoder, data.sizes, budget.network),
+            "observation": Autoencoder(encoder.requires_grad_(False), data.sizes, budget.network),
             "state": StateProbe(encoder, data.sizes),
         }
         draws = len(readouts) * (steps * budget.batch_size + min(len(data.hold_out_rows), INSPECTED))

@@ -31,7 +31,6 @@ from dmcvb_gen.agents.paper import (
     BehaviorCloning,
     InverseDynamics,
     LatentForwardDynamics,
-    ObservationProbe,
     StatePrediction,
     StateProbe,
 )
@@ -258,7 +257,7 @@ KINDS = {
     "laom": (
         lambda: LatentActionObservationModel(small_encoder(), SIZES), ("encoder", "see", "f.", "g.", "target"), 60, 0.3
     ),
-    "observation readout": (lambda: ObservationProbe(small_encoder(), SIZES), ("psi",), 60, 0.7),
+    "observation readout": (lambda: Autoencoder(small_encoder().requires_grad_(False), SIZES), ("psi",), 60, 0.7),
     "state readout": (lambda: StateProbe(small_encoder(), SIZES), ("h.",), 80, 0.05),
 }  # fmt: skip
 """A learner; the parameters that its first update moves; updates on eight transitions, and what share of the loss is

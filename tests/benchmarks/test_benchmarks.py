@@ -20,7 +20,7 @@ from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
 from dmcvb_gen.agents.data import Normalization, Slice, choose_episodes, labeled_episodes, load_data, normalize_pixels
 from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.agents.networks import PATCHES
-from dmcvb_gen.agents.paper import ObservationProbe, StateProbe
+from dmcvb_gen.agents.paper import Autoencoder, StateProbe
 from dmcvb_gen.agents.trainer import train
 from dmcvb_gen.benchmarks import cell as cells_module
 from dmcvb_gen.benchmarks.cell import CellRun, fingerprint, planned_steps, run_cells
@@ -427,7 +427,7 @@ def test_test_errors_of_decoders_that_say_nothing_are_the_spread_of_the_data(who
     seen = data.transitions(data.hold_out_rows)
     assert len(data.hold_out_rows)
     for probe, values in (
-        (ObservationProbe(encoder, data.sizes, network), seen.observation),
+        (Autoencoder(encoder, data.sizes, network), seen.observation),
         (StateProbe(encoder, data.sizes), seen.state),
     ):
         for weights in probe.parameters():
