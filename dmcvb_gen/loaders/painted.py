@@ -91,7 +91,6 @@ class PaintedSubset(SubsetReader):
     def _start(self) -> None:
         self._kept: OrderedDict[tuple[int, int, str], np.ndarray] = OrderedDict()
         self._drawn: OrderedDict[tuple[int, int], Drawn] = OrderedDict()
-        self._painter: tuple[Renderer, Any] | None = None
         self._bytes, self._lock = 0, threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:  # painters and what they painted stay where they are
@@ -206,17 +205,16 @@ class PaintedSubset(SubsetReader):
             raise StoreError(f"{self.name} has no episode {episode}; it has {len(self.episodes)} episodes")
 
     def _paint(self, episode: int, arrays: list[str]) -> dict[str, np.ndarray]:
-        renderer, _ = self._open_painter()
+        renderer, _ = self._painter
         drawn = self._drawn_of(episode)
         length, rows = np.array([drawn.length]), self.record.max_steps + 1
         physics, labels = drawn.physics[None, : drawn.length + 1], drawn.labels[None, : drawn.length + 1]
         pictures = paint(get_task(self.task), renderer, physics, labels, length, rows, arrays=arrays)
         return {name: value[0] for name, value in pictures}
 
-    def _open_painter(self) -> tuple[Renderer, Any]:
-        if self._painter is None:
-            self._painter = renderer_for(self.record, self._videos())
-        return self._painter
+    @functools.cached_property
+    def _painter(self) -> tuple[Renderer, Any]:
+        return renderer_for(self.record, self._videos())
 
     def _drawn_of(self, episode: int) -> Drawn:
         """What an episode's frames are painted from in this epoch; fresh labels are drawn with those of neighbors."""
@@ -243,16 +241,15 @@ class PaintedSubset(SubsetReader):
             self._drawn.popitem(last=False)
 
     def _fresh_labels(self, episodes: list[int], physics: np.ndarray, length: np.ndarray) -> DistractorState:
-        names, (_, videos) = (*self.trajectories.makes["streams"], f"epoch {self.epoch}"), self._open_painter()
+        names, (_, videos) = (*self.trajectories.makes["streams"], f"epoch {self.epoch}"), self._painter
         streams = (self.record, int(self.trajectories.makes["seed"]), names, np.array(episodes))
         return distractor_state_of(*streams, physics, length, videos, self.read("action", episodes))
 
     def _videos(self) -> str:
         given = self.painting.backgrounds
-        if given and self.painting.distractors == RESAMPLED:
+        if given and self.fresh:
             return given  # fresh distractors may show other videos
-        fresh = self.painting.distractors == RESAMPLED
-        shown = whose_videos(self.release, self.record) if fresh else self.record
+        shown = whose_videos(self.release, self.record) if self.fresh else self.record
         root = given or local_inputs(self.release.store, self.release.inputs_of([shown.name]))
         return background_source(root, shown, given)
 

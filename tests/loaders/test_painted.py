@@ -49,7 +49,7 @@ def test_labels_of_fresh_distractors_are_those_of_their_pictures(painted_and_lig
                 assert read.shape == shapes[array] and read.dtype == stored.array(array).dtype
                 assert not read[:, rows:].any()
                 np.testing.assert_array_equal(read[0, :rows], alone[array])
-            renderer, _ = subset._open_painter()
+            renderer, _ = subset._painter
             shown, views = subset.labels([episode])[:, :rows], subset.record.views
             physics = stored.read("physics", [episode])[0, :rows]
             pictures = renderer.render(physics, shown[0], views, False)
