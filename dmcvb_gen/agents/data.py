@@ -22,7 +22,7 @@ from torch import nn
 from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.arithmetic import to_unit
 from dmcvb_gen.dataset import Release, Subset
-from dmcvb_gen.dataset.pictures import training_pictures
+from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.parallel import ignore
@@ -439,7 +439,7 @@ def load_data(
       DmcvbError: the subsets are of different tasks or picture sizes, or hold no pictures.
     """
     subsets = [release[part.subset] for part in slices]
-    names = [training_pictures(subset).arrays if subset.pixel_arrays else () for subset in subsets]
+    names = [shown(subset, "agents").arrays if subset.pixel_arrays else () for subset in subsets]
     alike = {(s.task, s.record.size, s.record.action_repeat, len(n)) for s, n in zip(subsets, names, strict=True)}
     if len(alike) != 1:
         mixed = ", ".join(subset.name for subset in subsets)

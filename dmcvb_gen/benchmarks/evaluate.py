@@ -23,7 +23,7 @@ import numpy as np
 
 from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.manifest import MAX_STEPS
-from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, training_pictures
+from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, shown
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.files import replacing
@@ -139,8 +139,8 @@ class EvaluationScene:
         """Return the scene of a subset; `backgrounds`: the videos' folder, if it is not where the manifest says."""
         record, (renderer, samples) = subset.record, renderer_choice(subset).values()
         source = shown_videos(subset, backgrounds)
-        shown = (training_pictures(subset), record.size, renderer, samples, source)
-        return cls(subset.task, subset.setting, *shown, action_repeat=record.action_repeat)
+        look = (shown(subset, "agents"), record.size, renderer, samples, source)
+        return cls(subset.task, subset.setting, *look, action_repeat=record.action_repeat)
 
     @classmethod
     def parse(cls, where: str, **options: Any) -> EvaluationScene:

@@ -14,11 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
-from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.text import as_names
+
+if TYPE_CHECKING:
+    from dmcvb_gen.dataset.reader import Subset
 
 ONE_VIEW = ("pixels",)
 """The views of a task with one."""
@@ -26,12 +28,6 @@ SHOWN, HIDDEN = "pixels", "pixels_hidden_goal"
 """Folders of the pictures with the goal, and without it."""
 NOT_TRAINED_ON = ("overhead",)
 """Views that are collected, but that no agent sees (paper, section 3.2)."""
-
-
-class HasRecord(Protocol):
-    """A subset of an open release, as far as its images go."""
-
-    record: SubsetRecord
 
 
 @dataclass(frozen=True)
@@ -89,9 +85,9 @@ def picture_of(array: str) -> tuple[str, bool] | None:
     return view or ONE_VIEW[0], folder == HIDDEN
 
 
-def shown(subset: HasRecord | SubsetRecord, views: Sequence[str] | Literal["agents"] | None = None) -> Pictures:
-    """The pictures that a subset (or the subset of a record) shows: all its views, in the task's order, the goal
-    hidden if its setting says so; whether they are stored or not.
+def shown(subset: Subset, views: Sequence[str] | Literal["agents"] | None = None) -> Pictures:
+    """The pictures that a subset shows: all its views, in the task's order, the goal hidden if its setting says so;
+    whether they are stored or not.
 
     Args:
       views: only these views, in this order; "agents": those that agents are trained on, all but the overhead view.
@@ -99,12 +95,7 @@ def shown(subset: HasRecord | SubsetRecord, views: Sequence[str] | Literal["agen
     Raises:
       UnknownNameError: no such view.
     """
-    record = subset if isinstance(subset, SubsetRecord) else subset.record
+    record = subset.record
     if views == "agents":
         views = [view for view in record.views if view not in NOT_TRAINED_ON]
     return Pictures(record.views, record.hidden_goal).select(views)
-
-
-def training_pictures(subset: HasRecord) -> Pictures:
-    """The pictures that agents are trained on: those shown, less the overhead view."""
-    return shown(subset, "agents")

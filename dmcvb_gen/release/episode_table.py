@@ -16,7 +16,7 @@ from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import CARD_FOLDER
-from dmcvb_gen.dataset.pictures import shown, training_pictures
+from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
@@ -99,7 +99,7 @@ def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
 
 def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     """The column of the pictures: the stored ones, others rendered from physics states and labels."""
-    pictures = training_pictures(subset)
+    pictures = shown(subset, "agents")
     pictures = pictures if pictures.views else shown(subset)  # the overhead view, if there is no other
     name, frames = pictures.arrays[0], dict.fromkeys(episodes.tolist())
     lacking = episodes[subset.unpainted[episodes]] if name in subset.arrays else episodes

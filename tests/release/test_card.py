@@ -14,7 +14,7 @@ from PIL import Image
 
 from dmcvb_gen.cli.common import answer, print_table
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.pictures import training_pictures
+from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.paper import paper_returns
@@ -92,7 +92,7 @@ def test_the_hubs_loader_reads_the_episodes_with_their_first_frames(small_releas
         assert fields["configs"][0]["data_files"] == [{"split": "train", "path": "card/episodes.parquet"}]
         for row in rows:
             subset, episode = release[row["subset"]], row["episode"]
-            name = training_pictures(subset).arrays[0]
+            name = shown(subset, "agents").arrays[0]
             assert np.array_equal(np.asarray(row["first_frame"]), subset.array(name)[episode, 0])
             assert row["return"] == subset.read("return", [episode])[0] and row["policy"] == "random"
             assert row["seed"] == subset.read("seed", [episode])[0]
