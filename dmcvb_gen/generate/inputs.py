@@ -15,7 +15,7 @@ from dmcvb_gen.dataset.manifest import FileRecord, SubsetRecord
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, DmcvbError, StoreError
-from dmcvb_gen.files import sha256_file
+from dmcvb_gen.files import sha256_if_readable
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE
 from dmcvb_gen.storage.store import NotThere, Store
@@ -64,7 +64,7 @@ def policy_files(root: str | Path, record: SubsetRecord) -> tuple[str, ...]:
         candidates = [Path(root) / policy.path] if policy.path else []
         with contextlib.suppress(DmcvbError):  # the release's own copy is enough
             candidates += resolve_policies(record.task, record.level)
-        same = (str(path) for path in candidates if _digest(path) == policy.digest)
+        same = (str(path) for path in candidates if sha256_if_readable(path) == policy.digest)
         if (path := next(same, None)) is not None:
             found.append(path)
         else:
@@ -73,14 +73,6 @@ def policy_files(root: str | Path, record: SubsetRecord) -> tuple[str, ...]:
                 f"bundled with this dmcvb-gen; put its file at {policy.path}"
             )
     return tuple(found)
-
-
-def _digest(path: Path) -> str | None:
-    """The digest of a policy file, None if it cannot be read."""
-    try:
-        return sha256_file(path)
-    except OSError:
-        return None
 
 
 def background_source(root: str | Path, record: SubsetRecord, moved: str | None = None) -> str:

@@ -21,7 +21,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import sha256_file, write_bytes
+from dmcvb_gen.files import sha256_if_readable, write_bytes
 from dmcvb_gen.spec import is_maze
 
 INDEX = "policies.json"
@@ -51,8 +51,9 @@ def bundled_file(name: str) -> Path:
     Raises:
       DmcvbError: it cannot be unpacked, because no folder for it can be written.
     """
-    path = next((folder / name for folder in cache_folders() if _is_sound(folder / name, name)), None)
-    return path or _unpack(name)
+    places = (folder / name for folder in cache_folders())
+    sound = (path for path in places if sha256_if_readable(path) == bundled_digests()[name])
+    return next(sound, None) or _unpack(name)
 
 
 def cache_folders() -> list[Path]:
@@ -60,13 +61,6 @@ def cache_folders() -> list[Path]:
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
     return [Path(home) / "dmcvb-gen" / "policies", Path(tempfile.gettempdir()) / f"dmcvb-gen-{user}" / "policies"]
-
-
-def _is_sound(path: Path, name: str) -> bool:
-    try:
-        return sha256_file(path) == bundled_digests()[name]
-    except OSError:
-        return False
 
 
 def _unpack(name: str) -> Path:
