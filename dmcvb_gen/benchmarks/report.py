@@ -32,7 +32,7 @@ from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_json, write_text
-from dmcvb_gen.generate.info import return_statistics
+from dmcvb_gen.generate.info import STATISTICS, return_statistics
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
 from dmcvb_gen.spec import is_maze, task_folder
@@ -60,7 +60,6 @@ CHECKS = {
 """Check -> what it says when it passes. Checks of later versions are listed under their own names."""
 SHOWN = 200
 """Findings on the page; the JSON file has all."""
-STATISTICS = ("mean", "std", "min", "p25", "median", "p75", "max")
 SAMPLES = 2_000
 """Samples of the bootstrap."""
 FEWEST = 3

@@ -107,10 +107,9 @@ def _write_files(
 
 def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = None) -> Publication:
     """Place and day of publication: the given one, else those of the existing card of this version, else today."""
-    try:
+    known = None
+    with contextlib.suppress(OSError, ValueError):
         known = json.loads((folder / CROISSANT).read_text())
-    except (OSError, ValueError):
-        known = None
     if not isinstance(known, dict) or known.get("version") != manifest.version:
         known = {}
     date = str(known.get("datePublished") or datetime.date.today().isoformat())
@@ -248,10 +247,6 @@ def _arrays(release: Release) -> dict[tuple, list[str]]:
     return kinds
 
 
-BACKGROUND = "background"
-"""The part of a distractor that is told by its number of videos."""
-
-
 def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, str]]:
     """Rows (setting, what varies and how much) of the table of distractors; none for mazes alone."""
     settings: dict[str, DistractorSetting] = {}
@@ -269,7 +264,7 @@ def _varied(setting: DistractorSetting) -> str:
         found = [d for d in distractors_of(setting) if d.kinds]
         return f"s = {setting.scale:g}; " + "; ".join((d.__doc__ or d.__name__).splitlines()[0] for d in found)
     videos = "all videos" if setting.videos is None else f"up to {setting.videos} videos"
-    words = {BACKGROUND: videos, CUE: f"correlation {setting.scale_of(CUE):g}"}
+    words = {"background": videos, CUE: f"correlation {setting.scale_of(CUE):g}"}
     varied = [part for part in ALL_PARTS if setting.varies(part)]
     return ", ".join(f"{part}: {words.get(part, f's = {setting.scale_of(part):g}')}" for part in varied)
 

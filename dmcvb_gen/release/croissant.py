@@ -18,7 +18,6 @@ from dmcvb_gen.storage.hugging_face import HubStore
 from dmcvb_gen.storage.places import shown
 from dmcvb_gen.storage.store import open_store
 
-PROGRAM = "dmcvb-gen"
 HOME = "https://arxiv.org/abs/2409.18330"
 """The page of the benchmark that releases follow."""
 TYPES = {"string": "sc:Text", "bool": "sc:Boolean", "float64": "sc:Float", "image": "sc:ImageObject"}
@@ -66,8 +65,8 @@ def groups(release: Release) -> list[str]:
 
 def generator(release: Release) -> str:
     """The program that made a release, with its versions."""
-    notes = read_provenance(release.store)
-    return " and ".join(dict.fromkeys(f"dmcvb-gen {n['environment'].get('dmcvb-gen', '?')}" for n in notes)) or PROGRAM
+    made = (f"dmcvb-gen {note['environment'].get('dmcvb-gen', '?')}" for note in read_provenance(release.store))
+    return " and ".join(dict.fromkeys(made)) or "dmcvb-gen"
 
 
 def derived_from(release: Release) -> list[str]:

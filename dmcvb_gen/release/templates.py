@@ -15,17 +15,14 @@ class Safe(str):
     """A text that is Markdown already."""
 
 
-def markdown(value: object) -> str:
-    """A text in one line that shows its characters and is no HTML, no link and no cell of a table."""
-    return printable(str(value), line=" ").translate(MARKUP)
-
-
 def fill(name: str, **values: Any) -> str:
     """A template of `release/data`. In Markdown, values are escaped unless the template calls them safe."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     def escaped(value: object) -> object:
-        return value if isinstance(value, Safe) or not name.endswith(".md.jinja") else markdown(value)
+        if isinstance(value, Safe) or not name.endswith(".md.jinja"):
+            return value
+        return printable(str(value), line=" ").translate(MARKUP)  # one line that is no HTML, no link and no cell
 
     environment = Environment(
         loader=PackageLoader("dmcvb_gen.release", "data"),

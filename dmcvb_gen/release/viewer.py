@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -133,14 +132,14 @@ def _fitted(release: Release, parts: list[dict[str, Any]], max_bytes: int) -> tu
 
 
 def _page(release: Release, parts: list[dict[str, Any]]) -> bytes:
-    from jinja2 import Environment
+    from jinja2 import Environment, PackageLoader
 
     manifest = release.manifest
     facts = dict(name=manifest.name, version=manifest.version, digest=release.digest or "", episodes=parts)
     # In a script, "<" could end it, so the data have none.
     data = json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    template = files("dmcvb_gen.release").joinpath("data/viewer.html").read_text("utf-8")
-    return Environment(autoescape=True).from_string(template).render(title=manifest.name, data=data).encode()
+    templates = Environment(loader=PackageLoader("dmcvb_gen.release", "data"), autoescape=True)
+    return templates.get_template("viewer.html").render(title=manifest.name, data=data).encode()
 
 
 def _command(release: Release, path: str, subset: SubsetReader, index: int) -> str:
