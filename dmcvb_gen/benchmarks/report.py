@@ -8,6 +8,7 @@ Wherever a score stands, the budget that made it stands beside it.
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
 import io
 import json
@@ -149,15 +150,12 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
     except OSError as error:
         raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
     mine, path = {"release": release.manifest.name, "budget": budget.facts()}, folder / "budget.json"
-    try:
+    there = mine
+    with contextlib.suppress(OSError, ValueError):
         there = json.loads(path.read_text())
-    except (OSError, ValueError):
-        there = None
-    if there is not None and not (
-        isinstance(there, dict) and {*mine} == {*there} and isinstance(there["budget"], dict)
-    ):
+    if not (isinstance(there, dict) and {*mine} == {*there} and isinstance(there["budget"], dict)):
         raise DmcvbError(f"{path} is no note of a validation; give another --out")
-    if there is not None and there != mine:
+    if there != mine:
         names = {f"budget.{name}" for name in mine["budget"] if there["budget"].get(name) != mine["budget"][name]}
         names |= {"release"} if there["release"] != mine["release"] else set()
         whose = "release {release}, profile {budget[name]}, seed {budget[seed]}".format(**there)
