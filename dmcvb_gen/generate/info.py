@@ -100,19 +100,17 @@ def describe_package() -> dict[str, Any]:
 
     looking = ThreadPoolExecutor(1)
     renderers = looking.submit(available_renderers)  # OpenGL is tried in a process of its own
-    tasks = []
-    for task_id in task_ids():
-        task = get_task(task_id)
-        tasks.append(
-            dict(
-                id=task_id,
-                state=task.state_size,
-                action=task.action_size,
-                max_steps=task.max_steps,
-                views=list(task.views),
-                behaviours=bundled_levels(task_id),
-            )
+    tasks = [
+        dict(
+            id=task.id,
+            state=task.state_size,
+            action=task.action_size,
+            max_steps=task.max_steps,
+            views=list(task.views),
+            behaviours=bundled_levels(task.id),
         )
+        for task in map(get_task, task_ids())
+    ]
     return dict(
         version=__version__,
         tasks=tasks,
