@@ -251,9 +251,8 @@ class CellRun:
         if encoder:
             _load_encoder(encoder.path(".safetensors"), phi)
         policy = make_policy(cell.agent, phi, data.sizes, budget.network).to(budget.device)
-        trained = TrainedAgent(
-            cell.agent, data.sizes, policy, data.normalization, evaluation_of(self.release, budget, cell)
-        )
+        evaluation = evaluation_of(self.release, budget, cell)
+        trained = TrainedAgent(cell.agent, data.sizes, policy, data.normalization, evaluation)
         curve = self._train_policy(policy, trained, data)
         inspection = self.inspect(policy.encoder, data) if pixels and budget.readout_steps else None
         return self._facts(data, curve) | {

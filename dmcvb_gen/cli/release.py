@@ -159,7 +159,5 @@ def export(release, to, out, as_json, **options):
     dmcvb-gen export releases/mini --to hdf5 --only '*/*/none' --out exports/h5
     """
     folders = run_export(release, to, out, **options)
-    shown = [
-        str(Path(out) / folder.relative_to(local_path(out).absolute())) for folder in folders
-    ]  # as --out names them
+    shown = [str(Path(out) / folder.relative_to(local_path(out).absolute())) for folder in folders]  # as --out has it
     answer(as_json, shown, *shown)

@@ -461,10 +461,8 @@ def check_videos_shown(records: Iterable[SubsetRecord], given: str | None) -> No
 
 def recorded_shards(store: Store, layer: str) -> frozenset[int]:
     """Numbers of the shards of a layer whose record is there; one listing."""
-    found = [
-        re.fullmatch(rf"{re.escape(RECORDS + layer)}/(\d{{5,6}})\.json", p) for p in store.list(f"{RECORDS}{layer}/")
-    ]
-    numbers = frozenset(int(match[1]) for match in found if match)
+    record = re.compile(rf"{re.escape(RECORDS + layer)}/(\d{{5,6}})\.json")
+    numbers = frozenset(int(found[1]) for found in map(record.fullmatch, store.list(f"{RECORDS}{layer}/")) if found)
     if len(numbers) > MAX_SHARDS:
         raise StoreError(f"{store.place} has {len(numbers):,} records of {layer}, more than any release")
     return numbers

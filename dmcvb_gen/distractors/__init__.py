@@ -74,9 +74,8 @@ class DistractorSampler:
                 distractor.adjust(found, actions, frames)
             if self.own:
                 self._check(found, physics.shape[:-1])
-        return DistractorState(
-            **{name: found[name].astype(LABEL_DTYPES[name]) for name in LABEL_DTYPES if name in found}
-        )
+        typed = {name: found[name].astype(LABEL_DTYPES[name]) for name in LABEL_DTYPES if name in found}
+        return DistractorState(**typed)
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:

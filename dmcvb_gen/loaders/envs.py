@@ -213,9 +213,8 @@ class _Stage:
         """Labels of the frame that each place shows now, leading shape (place,)."""
         found = {int(frame): self.walk.labels(physics, self.action, int(frame)) for frame in np.unique(self.frame)}
         parts = [found[int(frame)][place : place + 1] for place, frame in enumerate(self.frame)]
-        return DistractorState(
-            **{name: np.concatenate([getattr(p, name) for p in parts]) for name, _ in parts[0].items()}
-        )
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name, _ in parts[0].items()}
+        return DistractorState(**joined)
 
     def observe(self) -> dict[str, np.ndarray]:
         """ "pixels" (place, size, size, 3 * view) uint8 or stacked, "state" (place, state) float32, modalities (place,

@@ -140,15 +140,8 @@ def _layers(source: _Source) -> list[Layer]:
     given: dict[str, Any] = dict(rows=rows, episodes_per_shard=per_shard, makes=facts, source=ORIGIN)
     arrays = tuple(spec for spec in trajectory_arrays(get_task(record.task)) if spec.name != "physics")
     group = f"{record.name}.zarr"
-    layers = [
-        Layer(
-            name=f"{record.name}/trajectories",
-            group=f"{group}/trajectories",
-            kind="trajectories",
-            arrays=arrays,
-            **given,
-        )
-    ]
+    simulated: dict[str, Any] = given | {"kind": "trajectories", "arrays": arrays}
+    layers = [Layer(name=f"{record.name}/trajectories", group=f"{group}/trajectories", **simulated)]
     for name in picture_arrays(record.views, record.hidden_goal):
         spec = image_array(name, record.size, record.spec.camera_moves, rows)
         place = f"{record.name}/{spec.stored_name}"

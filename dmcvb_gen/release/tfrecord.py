@@ -17,9 +17,8 @@ MAX_RECORD = 2**31
 """Bytes of a record beyond which the file is taken to be damaged."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
-_LISTS = {"bytes_list": ("BytesList", _FIELD.TYPE_BYTES), "float_list": ("FloatList", _FIELD.TYPE_FLOAT)} | {
-    "int64_list": ("Int64List", _FIELD.TYPE_INT64)
-}
+_LISTS = {"bytes_list": ("BytesList", _FIELD.TYPE_BYTES), "float_list": ("FloatList", _FIELD.TYPE_FLOAT)}
+_LISTS |= {"int64_list": ("Int64List", _FIELD.TYPE_INT64)}
 
 
 def _example_class() -> Any:

@@ -525,9 +525,8 @@ class Sac(Learner):
 
     def metrics(self) -> dict[str, float]:
         """Losses, policy entropy (nats) and temperature of the last update."""
-        return {name: float(value) for name, value in self._losses.items()} | {
-            "temperature": float(self.log_alpha.detach().exp())
-        }
+        losses = {name: float(value) for name, value in self._losses.items()}
+        return losses | {"temperature": float(self.log_alpha.detach().exp())}
 
     def load_networks(self, state: Mapping[str, Any]) -> None:
         super().load_networks(state)

@@ -143,9 +143,8 @@ def converge(steps: Sequence[int], returns: Sequence[float], base: float = 0.0) 
     if best == len(means) - 1:
         before = float(even[max(0, best - 16) : best].mean())
         if value - before > 0.05 * way:
-            return Convergence(
-                value, error, False, f"the return still rises (from {before:.1f} to {value:.1f} in the last quarter)"
-            )
+            rises = f"the return still rises (from {before:.1f} to {value:.1f} in the last quarter)"
+            return Convergence(value, error, False, rises)
     return Convergence(value, error, True)
 
 
