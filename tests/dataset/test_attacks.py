@@ -73,7 +73,8 @@ def _manifest_file(root: Path) -> Path:
 
 
 def _list_file(root: Path) -> Path:
-    return next((root / "layers").iterdir())
+    first = json.loads(_manifest_file(root).read_bytes())["layers"][0]  # which is read; a disk lists any one first
+    return root / "layers" / f"{first['list']}.json"
 
 
 def _sparse(path: Path) -> None:
