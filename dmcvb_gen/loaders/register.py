@@ -65,12 +65,8 @@ def register() -> None:
 
     for name, (task, setting) in environments().items():
         if name not in gymnasium.registry:
-            gymnasium.register(
-                name,
-                entry_point=ENTRY_POINT,
-                vector_entry_point=VECTOR_ENTRY_POINT,
-                kwargs={"task": task, "distractor": setting},
-            )
+            scene = {"task": task, "distractor": setting}
+            gymnasium.register(name, ENTRY_POINT, vector_entry_point=VECTOR_ENTRY_POINT, kwargs=scene)
 
 
 def register_with_gymnasium() -> None:
