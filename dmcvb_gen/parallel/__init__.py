@@ -18,18 +18,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 from dmcvb_gen.parallel.base import KEPT, Needs, Pool, ProgressCallback, Ray, SerialPool, Workers, expect, ignore
 
-__all__ = [
-    "Needs",
-    "Pool",
-    "Ray",
-    "SerialPool",
-    "ProgressCallback",
-    "Workers",
-    "expect",
-    "ignore",
-    "in_order",
-    "open_pool",
-]
+__all__ = ["Needs", "Pool", "Ray", "ProgressCallback", "Workers", "expect", "ignore", "in_order", "open_pool"]
 
 
 def open_pool(
