@@ -121,13 +121,9 @@ def _show_picks(picked, run):
     _tell(f"{task_folder(picked.task)}: return at convergence {picked.convergence.standing}")
     picks = [pick for level in picked.picks.values() for pick in level]
     if picks:
-        print_table(
-            ("pick", "agent step", "<aimed at", "mean", "std"),
-            [
-                (pick.name, f"{pick.step:,}", pick.target, f"{pick.evaluation.mean:.1f}", f"{pick.evaluation.std:.1f}")
-                for pick in picks
-            ],
-        )
+        found = [(pick, pick.evaluation) for pick in picks]
+        rows = [(p.name, f"{p.step:,}", p.target, f"{fresh.mean:.1f}", f"{fresh.std:.1f}") for p, fresh in found]
+        print_table(("pick", "agent step", "<aimed at", "mean", "std"), rows)
     for level, reason in picked.reasons.items():
         _tell(f"{level} cannot be picked yet: {reason}")
     click.echo(f"Wrote {'selected/, ' * bool(picks)}selection.json and curve.png into {run}.")

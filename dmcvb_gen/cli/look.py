@@ -94,22 +94,11 @@ def list_command(as_json):
     facts = describe_package()
     if as_json:
         return print_json(facts)
-    print_table(
-        ("task", "state", "action", "steps", "<views", "<bundled behaviours"),
-        [
-            (
-                task["id"],
-                str(task["state"]),
-                str(task["action"]),
-                str(task["max_steps"]),
-                ", ".join(task["views"]),
-                ", ".join(task["behaviours"]) or "-",
-            )
-            for task in facts["tasks"]
-        ],
-        title="tasks",
-        optional=(("views",),),
-    )
+    columns, rows = ("task", "state", "action", "steps", "<views", "<bundled behaviours"), []
+    for task in facts["tasks"]:
+        sizes = (task[name] for name in ("state", "action", "max_steps"))
+        rows.append((task["id"], *sizes, ", ".join(task["views"]), ", ".join(task["behaviours"]) or "-"))
+    print_table(columns, rows, title="tasks", optional=(("views",),))
     for heading, names in (
         ("tasks of dm_control's suite", facts["suite_tasks"]),
         ("of these with bundled expert, medium and mixed", facts["suite_behaviours"]),

@@ -308,12 +308,8 @@ class Release:
         """Policies and videos of some subsets, of which the release keeps copies."""
         wanted = [record for record in self.manifest.subsets if record.name in names]
         policies = {policy.path for record in wanted for policy in record.policies if policy.path}
-        videos = {str((record.backgrounds or {}).get("source", "")) for record in wanted} - {""}
-        return tuple(
-            file
-            for file in self.manifest.inputs
-            if file.path in policies or any(file.path.startswith(f"{folder}/") for folder in videos)
-        )
+        videos = tuple(f"{record.backgrounds['source']}/" for record in wanted if record.backgrounds)
+        return tuple(file for file in self.manifest.inputs if file.path in policies or file.path.startswith(videos))
 
     # -- subsets --------------------------------------------------------------------------------------
 

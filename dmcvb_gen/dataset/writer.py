@@ -317,12 +317,9 @@ def plain_metadata(release: Release) -> dict[str, bytes]:
 
 def _add_layer(nodes: dict[str, dict[str, Any]], release: Release, subset: SubsetRecord, layer: Layer) -> None:
     root, _, setting = layer.group.partition(".zarr/")
-    shared: dict[str, Any] = {
-        "task": subset.task,
-        "level": subset.level,
-        "release": f"{release.manifest.name} {release.manifest.version}",
-    }
-    shared |= {"seconds_per_step": subset.seconds_per_step, "layout": ROW_LAYOUT}
+    shared: dict[str, Any] = {"task": subset.task, "level": subset.level, "layout": ROW_LAYOUT}
+    shared |= {"release": f"{release.manifest.name} {release.manifest.version}"}
+    shared |= {"seconds_per_step": subset.seconds_per_step}
     nodes.setdefault(f"{root}.zarr", _group(shared))
     facts = {} if layer.kind == "trajectories" else {"setting": subset.setting, "views": list(subset.views)}
     nodes.setdefault(f"{root}.zarr/{setting}", _group(facts))

@@ -308,14 +308,8 @@ def _settle(work: Work, layer: Layer, arrays: Iterable[tuple[str, np.ndarray]]) 
             files[name] = _put_file(work, path, data, facts, first_wins)
     if work.purpose != "check" and not differences:
         put_record(work.store, layer, work.shard, ShardRecord(key=layer.job_key(work.shard), files=files))
-    return ShardOutcome.of(
-        layer,
-        work.shard,
-        was=was,
-        equal=None if known is None else not differences,
-        repaired=work.purpose == "repair" and not differences,
-        differences=tuple(differences),
-    )
+    equal, repaired = None if known is None else not differences, work.purpose == "repair" and not differences
+    return ShardOutcome.of(layer, work.shard, was=was, equal=equal, repaired=repaired, differences=tuple(differences))
 
 
 def _put_file(work: Work, path: str, data: bytes, facts: ShardFile, first_wins: bool) -> ShardFile:

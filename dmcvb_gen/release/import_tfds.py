@@ -162,12 +162,8 @@ def _sources(found: list[Path], task, level, setting) -> list[_Source]:
             raise StoreError(f"{members[1][0]} and {members[0][0]} are both {name}; import one of them")
         members.sort(key=lambda member: member[1][3] or 0)
         folders = tuple(path for path, _ in members)
-        places = tuple(
-            Place(goal, file, *place)
-            for goal, path in enumerate(folders)
-            for file in _files(path)
-            for place in offsets(file)
-        )
+        files = [(goal, file) for goal, path in enumerate(folders) for file in _files(path)]
+        places = tuple(Place(goal, file, *place) for goal, file in files for place in offsets(file))
         sources.append(_Source(_record(name, members[0][1][:3], folders, places), folders, places))
     return sources
 

@@ -24,14 +24,9 @@ def fill(name: str, **values: Any) -> str:
             return value
         return printable(str(value), line=" ").translate(MARKUP)  # one line that is no HTML, no link and no cell
 
-    environment = Environment(
-        loader=PackageLoader("dmcvb_gen.release", "data"),
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        undefined=StrictUndefined,
-        finalize=escaped,
-    )
+    layout: dict[str, Any] = dict(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    loader = PackageLoader("dmcvb_gen.release", "data")
+    environment = Environment(loader=loader, undefined=StrictUndefined, finalize=escaped, **layout)
     environment.filters["safe"] = Safe
     environment.filters["python"] = lambda text: Safe(json.dumps(printable(text, line=" ")))
     environment.filters["shell"] = lambda text: Safe(quoted(printable(text, line=" ")))

@@ -124,11 +124,8 @@ class _Layout:
 
     def _features(self, source: Source) -> dict[str, Any]:
         scalar: dict[str, Any] = {"shape": [1], "names": None}
-        picture: dict[str, Any] = {
-            "dtype": "image",
-            "shape": [self.size, self.size, 3],
-            "names": ["height", "width", "channel"],
-        }
+        shape, axes = [self.size, self.size, 3], ["height", "width", "channel"]
+        picture: dict[str, Any] = {"dtype": "image", "shape": shape, "names": axes}
         state, actions = source.names["state"], source.names["action"]
         return {
             **{key: picture for key in self.keys.values()},
