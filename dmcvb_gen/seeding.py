@@ -15,6 +15,8 @@ STREAMS = ("initial_state", "policy", "camera", "color", "background", "style", 
 """The streams of an episode, in the order of their spawn keys. Append only: an index is part of the data.
 
 No distractor draws from "shake" any more."""
+DISTRACTOR_STREAMS = tuple(name for name in STREAMS if name not in ("initial_state", "policy"))
+"""Those that the simulation leaves to distractors."""
 
 
 def name_key(*names: str) -> tuple[int, ...]:

@@ -34,7 +34,7 @@ from dmcvb_gen.generate.render import open_renderer
 from dmcvb_gen.generate.request import background_source
 from dmcvb_gen.options import Count, Location, Seed, Split, checked
 from dmcvb_gen.policies.evaluation import goal_scores
-from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.seeding import DISTRACTOR_STREAMS, episode_stream
 from dmcvb_gen.spec import LEVELS, GoalMode, SubsetSpec, parse_setting, task_folder
 from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
 
@@ -254,7 +254,7 @@ class Evaluator:
         """The distractors of the episodes; None for policies that see states."""
         if self.renderer is None:
             return None
-        generators = {name: self.streams(name) for name in STREAMS if name not in ("initial_state", "policy")}
+        generators = {name: self.streams(name) for name in DISTRACTOR_STREAMS}
         frames, split = self.steps + 1, self.scene.split
         return DistractorSampler(self.task, self.setting, frames, generators, self.videos, split=split)
 

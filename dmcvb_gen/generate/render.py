@@ -20,7 +20,7 @@ from dmcvb_gen.generate.modalities import Modality, Seen, get_modality
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import renderer_class
 from dmcvb_gen.rendering.base import Renderer
-from dmcvb_gen.seeding import STREAMS, episode_stream
+from dmcvb_gen.seeding import DISTRACTOR_STREAMS, episode_stream
 from dmcvb_gen.spec import DistractorSetting
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -31,8 +31,6 @@ MOST_RENDERERS = 4
 """Renderers of a task that a process keeps."""
 LABEL_FRAMES = 512
 """Frames of depth, segmentation or flow that are rendered at once."""
-SIMULATION_STREAMS = ("initial_state", "policy")
-"""Random streams of an episode that the simulation uses; the others are for distractors."""
 
 
 def check_renderer(name: str) -> None:
@@ -121,11 +119,7 @@ def distractor_state_of(
     padded = physics[:, :rows].copy()
     last = physics[np.arange(len(physics)), length]
     padded[after] = np.repeat(last, after.sum(axis=1), axis=0)  # a state that MuJoCo can be put into
-    generators = {
-        name: [episode_stream(seed, names, int(i), name) for i in episodes]
-        for name in STREAMS
-        if name not in SIMULATION_STREAMS
-    }
+    generators = {name: [episode_stream(seed, names, int(i), name) for i in episodes] for name in DISTRACTOR_STREAMS}
     setting = record.distractor
     before = np.zeros((len(padded), rows, task.action_size))
     before[:, 1:] = action[:, : rows - 1]
