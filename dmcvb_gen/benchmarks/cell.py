@@ -339,10 +339,8 @@ class CellRun:
         """Measure what a frozen encoder still knows: test errors of decoders of its latents (section 5.1)."""
         budget, steps = self.budget, self.budget.readout_steps
         torch.manual_seed(budget.seed)
-        readouts = {
-            "observation": Autoencoder(encoder.requires_grad_(False), data.sizes, budget.network),
-            "state": StateProbe(encoder, data.sizes),
-        }
+        pictures = Autoencoder(encoder.requires_grad_(False), data.sizes, budget.network)
+        readouts = {"observation": pictures, "state": StateProbe(encoder, data.sizes)}
         draws = len(readouts) * (steps * budget.batch_size + min(len(data.hold_out_rows), INSPECTED))
         data, found = self._encoded(encoder, data, draws), dict[str, Any]()
         for name, learner in readouts.items():
@@ -350,11 +348,11 @@ class CellRun:
             self._fit(learner, data, steps, f"{name} decoder", shift=budget.frozen_shift)
             self.tick("test errors of the decoders", 0)
             found[f"{name}_mse"] = test_error(learner, data, budget.batch_size)
-        batch = draw(readouts["observation"], data, 8, budget.seed, 0, hold_out=len(data.hold_out_rows) > 0)
-        with torch.no_grad(), readouts["observation"].precision():
-            seen = readouts["observation"].predict(batch).float()
+        batch = draw(pictures, data, 8, budget.seed, 0, hold_out=len(data.hold_out_rows) > 0)
+        with torch.no_grad(), pictures.precision():
+            seen = pictures.predict(batch).float()
         newest = slice(-data.frames.channels, None)
-        rows = [_to_pictures(pictures[:, newest][:, :3]) for pictures in (batch.observation, seen)]
+        rows = [_to_pictures(row[:, newest][:, :3]) for row in (batch.observation, seen)]
         _save_sheet(self.path(".decoder.png"), rows)
         return found
 

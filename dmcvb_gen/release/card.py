@@ -306,11 +306,8 @@ def _limits(release: Release, facts: dict[str, Any]) -> list[str]:
         limits.append("Backgrounds are the generator's own clips of falling objects, not DMC-VB's Kubric videos.")
     limits += _lacking_videos(release)
     policies = {policy.digest: policy for record in manifest.subsets for policy in record.policies}.values()
-    own = {
-        f"Behaviour `{p.name}`": p.header["training"]["source_sha256"]
-        for p in policies
-        if p.header.get("algorithm") == OWN_CODE
-    }
+    coded = [policy for policy in policies if policy.header.get("algorithm") == OWN_CODE]
+    own = {f"Behaviour `{policy.name}`": policy.header["training"]["source_sha256"] for policy in coded}
     for layer in release.layers.values():
         if code := layer.makes.get("code"):
             what = "task" if layer.kind == "trajectories" else "distractor"

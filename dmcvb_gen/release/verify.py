@@ -291,14 +291,9 @@ def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
 
 def _empty(release: Release) -> set[str]:
     """Paths that shards which are here leave free, because an array holds nothing but its fill value."""
-    return {
-        layer.file_path(spec, shard.number)
-        for name, layer in release.layers.items()
-        for shard in release.layer_shards(name)
-        if shard.here
-        for spec in layer.arrays
-        if spec.name not in shard.record.files
-    }
+    here = [shard for name in release.layers for shard in release.layer_shards(name) if shard.here]
+    empty = [(shard, spec) for shard in here for spec in shard.layer.arrays if spec.name not in shard.record.files]
+    return {shard.layer.file_path(spec, shard.number) for shard, spec in empty}
 
 
 # -- values ---------------------------------------------------------------------------------------

@@ -149,8 +149,7 @@ def export(run: Run, model: BaseAlgorithm) -> tuple[dict[str, torch.Tensor], dic
 def state_of(model: BaseAlgorithm) -> dict[str, Any]:
     """What a run goes on from."""
     variables = {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
-    state: dict[str, Any] = {"parameters": model.get_parameters(), "variables": variables}
-    state["updates"] = model._n_updates
+    state: dict[str, Any] = {"parameters": model.get_parameters(), "variables": variables, "updates": model._n_updates}
     if normalize := model.get_vec_normalize_env():
         norms = {name: getattr(normalize, name) for name in ("obs_rms", "ret_rms") if hasattr(normalize, name)}
         state["norms"] = {n: [torch.as_tensor(v) for v in (rms.mean, rms.var, rms.count)] for n, rms in norms.items()}
