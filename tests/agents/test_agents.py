@@ -359,9 +359,8 @@ def test_laoms_supervised_variant_learns_from_the_actions_of_labeled_transitions
     loss, labels = (learner.metrics(labeled)[name] for name in ("loss", "labels"))
     assert learner.metrics(dataclasses.replace(labeled, action=batch.action + 9))["loss"] == loss
     for name, value in (("action", batch.action + 9), ("later_observation", batch.observation)):
-        other = learner.metrics(
-            dataclasses.replace(labeled, labeled=dataclasses.replace(labeled.labeled, **{name: value}))
-        )
+        changed = dataclasses.replace(labeled.labeled, **{name: value})
+        other = learner.metrics(dataclasses.replace(labeled, labeled=changed))
         assert other["labels"] != labels
         assert (other["loss"] - loss).item() == pytest.approx(0.001 * (other["labels"] - labels).item(), abs=1e-6)
     assert "labels" not in learner.metrics(batch)

@@ -82,16 +82,10 @@ def test_the_next_observation_is_k_steps_on_under_the_same_shift():
     data, pictures = make_data(), pictures_of(make_data())
     batch = data.batch(64, np.random.default_rng(1), next_observation=True, k=2)
     for index, row in enumerate(batch.reward.long().tolist()):
-        shifts = [
-            (down, right)
-            for down in range(2 * PAD + 1)
-            for right in range(2 * PAD + 1)
-            if np.allclose(batch.observation[index], by_hand(pictures, _stack(row), down, right), atol=1e-6)
-        ]
-        assert len(shifts) == 1
-        np.testing.assert_allclose(
-            batch.next_observation[index], by_hand(pictures, _stack(row + 2), *shifts[0]), atol=1e-6
-        )
+        shifted = {shift: by_hand(pictures, _stack(row), *shift) for shift in np.ndindex(2 * PAD + 1, 2 * PAD + 1)}
+        [shift] = [at for at, seen in shifted.items() if np.allclose(batch.observation[index], seen, atol=1e-6)]
+        following = by_hand(pictures, _stack(row + 2), *shift)
+        np.testing.assert_allclose(batch.next_observation[index], following, atol=1e-6)
 
 
 def test_the_later_observation_is_k_steps_on_and_the_next_one_a_step():
@@ -107,9 +101,8 @@ def test_the_later_observation_is_k_steps_on_and_the_next_one_a_step():
 
 def test_labeled_transitions_are_those_of_some_episodes_and_tests_are_of_others():
     data = make_data(held=(True, True, False)).with_labels(np.array([True, False, True]))
-    drawn = data.but(train_rows=data.labeled_rows).batch(
-        200, np.random.default_rng(0), next_observation=True, shift=False
-    )
+    labeled = data.but(train_rows=data.labeled_rows)
+    drawn = labeled.batch(200, np.random.default_rng(0), next_observation=True, shift=False)
     rows = drawn.reward.long()
     assert set(rows.tolist()) == {0, 1, 2, 3, 13, 14}
     torch.testing.assert_close(drawn.next_observation, data.observe(rows + 1))

@@ -158,9 +158,7 @@ def test_every_group_of_cells_has_a_figure_with_its_data_if_they_are_alike(relea
     point = {"step": 1, "loss": 1.0, "score": {"mean": 1.0, "stderr": 0.1}}
     cells = [replace(cell, setting=f"setting{number}") for number in range(3)]
     data = {"mean": 1.0, "limit": 500}
-    results = [
-        (cell, {"curve": [point], "data": data, "score": {"limit": 500 + number}}) for number, cell in enumerate(cells)
-    ]
+    results = [(cell, {"curve": [point], "data": data, "score": {"limit": 500 + i}}) for i, cell in enumerate(cells)]
     drawn = [figure.axes[1].get_lines() for figure in curve_figures(results, "smoke")]
     labels = [[line.get_label() for line in lines] for lines in drawn]
     assert ["data" in names for names in labels] == [True, False, False]  # only of like episodes
@@ -572,9 +570,8 @@ def test_a_maze_release_goes_through_b1_and_b3(small_mazes, tmp_path):
     result = invoke(*command, "--workers", 1, "--threads", 1, "--out", out, code=0)
     facts = json.loads((out / "report.json").read_text(), parse_constant=pytest.fail)  # a goal's one episode: no NaN
     ran = [(r["cell"]["benchmark"], r["cell"]["agent"], r["labels"]["policy"]) for r in facts["results"]]
-    assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | {
-        ("b3", agent, f"random goal {pair}") for agent in ("bc", "id+bc") for pair in range(2)
-    }
+    of_goals = {("b3", agent, f"random goal {pair}") for agent in ("bc", "id+bc") for pair in range(2)}
+    assert set(ran) == {("b1", agent, "random") for agent in ("state-bc", "bc", "id+bc")} | of_goals
     by_id = {r["id"]: r for r in facts["results"]}
     pretrained = next(r for name, r in by_id.items() if name.startswith("b3") and "id-bc" in name.replace("+", "-"))
     assert [part["subset"] for part in pretrained["cell"]["pretrain"]] == [f"{MAZE}/hidden"]

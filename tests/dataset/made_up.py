@@ -27,10 +27,8 @@ TASK = SimpleNamespace(
 
 
 def _layer(name: str, group: str, kind: str, arrays: Sequence, **makes: object) -> Layer:
-    rows = MAX_STEPS + 1
-    return Layer(
-        name=name, group=group, kind=kind, rows=rows, episodes_per_shard=PER_SHARD, arrays=tuple(arrays), makes=makes
-    )
+    facts = {"rows": MAX_STEPS + 1, "episodes_per_shard": PER_SHARD, "makes": makes}
+    return Layer(name=name, group=group, kind=kind, arrays=tuple(arrays), **facts)
 
 
 KEPT = ("state", "action", "length", "return", "goal_pair", "exogenous/style", "exogenous/camera_position")

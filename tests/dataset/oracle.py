@@ -48,7 +48,6 @@ def check(root: Path) -> dict | None:
                 chunks = [path for path in (folder / "c").rglob("*") if path.is_file()]
                 own = [path for path in chunks if path.relative_to(folder / "c").parts[0] == str(number)]
                 assert len(own) == 1, f"{array} of {record} has {len(own)} files"
-                assert own[0].stat().st_size == file["bytes"] and sha256(own[0]) == file["sha256"], (
-                    f"{own[0]} is damaged"
-                )
+                facts = {"bytes": own[0].stat().st_size, "sha256": sha256(own[0])}
+                assert facts == file, f"{own[0]} is damaged"
     return manifest

@@ -97,6 +97,5 @@ def test_xarray_opens_a_set_of_trajectories_with_all_its_settings(request, famil
     assert tree.attrs["task"] == subset.task and not states.coords
     labels = zarr.open_group(str(root / group), mode="r")[f"{subset.setting}/exogenous/style"]
     np.testing.assert_array_equal(labels[:], subset.read("exogenous/style"))
-    assert {"state", "pixels" if family == "small_release" else "pixels_top"} <= {
-        *xarray.merge([states.to_dataset(), setting.to_dataset()])
-    }
+    merged = xarray.merge([states.to_dataset(), setting.to_dataset()])
+    assert {"state", "pixels" if family == "small_release" else "pixels_top"} <= {*merged}

@@ -15,9 +15,8 @@ from tests.conftest import TINY_MAZE, maze_recipe, roll_out
 def test_all_views_with_and_without_the_goal(maze_release):
     subset = Release.open(maze_release)["ant-maze-tiny/random/visible"]
     task, episode = get_task(TINY_MAZE), subset.episode(0)
-    assert set(subset.pixel_arrays) == {
-        f"{root}/{view}" for root in ("pixels", "pixels_hidden_goal") for view in task.views
-    }
+    folders = ("pixels", "pixels_hidden_goal")
+    assert set(subset.pixel_arrays) == {f"{folder}/{view}" for folder in folders for view in task.views}
     length = len(episode["action"])
     assert episode["pixels/top"].shape == (length + 1, 16, 16, 3)
     assert (episode["pixels/top"] != episode["pixels_hidden_goal/top"]).any(axis=(1, 2, 3)).all()

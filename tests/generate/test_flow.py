@@ -60,10 +60,8 @@ def test_flow_is_that_of_points_on_mujocos_geoms(task_id, setting):
     found = get_modality("flow").compute(seen)[0]
     segmentation = renderer.render_labels(physics[:1], labels[:1], [view])["segmentation"][0, 0]
     assert found.shape == (SIZE, SIZE, 2) and found.dtype == np.float32
-    eyes = [
-        (labels.camera_position[i, column].astype(float), matrices(labels.camera_quaternion[i : i + 1, column])[0])
-        for i in range(2)
-    ]
+    turns = matrices(labels.camera_quaternion[:2, column])
+    eyes = list(zip(labels.camera_position[:2, column].astype(float), turns, strict=True))
     pixels = rng.integers(0, SIZE, (300, 2))
     poses = [pose(task.model, physics[i]) for i in range(2)]
     expected, geoms = flow_by_rays(task, *poses, *eyes, column, pixels)

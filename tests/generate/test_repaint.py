@@ -85,9 +85,7 @@ def test_wrong_labels_are_found(request, source, name, tmp_path):
 
     rewrite(tmp_path / "r", name, change)
     found = verify(tmp_path / "r").findings
-    assert {(finding.check, finding.message.split()[0]) for finding in found} == {
-        ("modalities", name) for name in arrays
-    }
+    assert {(issue.check, issue.message.split()[0]) for issue in found} == {("modalities", name) for name in arrays}
 
 
 @pytest.mark.slow

@@ -18,9 +18,8 @@ def test_readers_stack_the_right_pictures(stored):
         for held in (True, False):
             np.testing.assert_array_equal(subset.source(in_memory=held)[before + 5]["pixels"], expected)
             np.testing.assert_array_equal(subset.torch("steps", in_memory=held)[before + 5]["pixels"], expected)
-        np.testing.assert_array_equal(
-            subset.torch("episodes")[1]["pixels"], [stack_channels([row]) for row in values["pixels"]]
-        )
+        alone = [stack_channels([row]) for row in values["pixels"]]
+        np.testing.assert_array_equal(subset.torch("episodes")[1]["pixels"], alone)
         [batch] = subset.batches(10**6)
         chosen = (batch["episode"] == 1) & (batch["step"] == 5)
         np.testing.assert_array_equal(batch["pixels"][chosen][0], expected)

@@ -118,9 +118,8 @@ def test_fixed_mazes_go_round_the_fixed_pairs_and_hide_the_goal():
     pairs, cells = fixed_pairs(task.layout, FIXED_GOALS, 3), []
     for _ in range(FIXED_GOALS + 1):
         observation, info = env.reset(seed=5 if not cells else None)
-        places = (
-            observation["state"][task.state_slices[field]][:2] for field in ("walker_position", "target_position")
-        )
+        fields = [task.state_slices[name] for name in ("walker_position", "target_position")]
+        places = (observation["state"][field][:2] for field in fields)
         cells.append(tuple(tuple(int(x) for x in np.rint(task.layout.grid(place[None])[0])) for place in places))
         assert pairs[info["goal_pair"]] == cells[-1]
     assert cells == [*pairs, pairs[0]]

@@ -49,9 +49,8 @@ def test_a_policy_is_scored_as_its_data_are_and_normalized_by_them(levels):
         return np.zeros((len(observation["state"]), release[expert].array("action").shape[-1]))
 
     score = release[expert].evaluate(still, split="train", episodes=2)
-    by_name = dmcvb_gen.evaluate(
-        still, f"{task}/{expert.split('/')[2]}", split="train", episodes=2, size=16, renderer="native", max_steps=6
-    )
+    given = dict(split="train", episodes=2, size=16, renderer="native", max_steps=6)
+    by_name = dmcvb_gen.evaluate(still, f"{task}/{expert.split('/')[2]}", **given)
     assert score.returns == by_name.returns and by_name.normalized is None
     low, high = (Release.open(folder)[name].read("return").mean() for name in (random, expert))
     assert score.normalized == pytest.approx(100 * (score.mean - low) / (high - low))

@@ -90,9 +90,8 @@ def test_fresh_distractors_come_with_the_epoch_through_every_torch_data_set(pain
     subset = distracted(dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="resample"))
     few = [int(subset.episodes[0])]
     data = subset.torch(kind, episodes=few, **({"batch_size": 4, "shuffle": False} if kind == "stream" else {}))
-    loader = torch.utils.data.DataLoader(
-        data, batch_size=None if kind == "stream" else 1, num_workers=workers, persistent_workers=workers > 0
-    )
+    given = {"num_workers": workers, "persistent_workers": workers > 0}
+    loader = torch.utils.data.DataLoader(data, batch_size=None if kind == "stream" else 1, **given)
     seen = []
     for epoch in (0, 1, 0):
         data.set_epoch(epoch)

@@ -268,7 +268,6 @@ def test_a_batch_of_no_steps_is_an_empty_batch(release, in_memory, request):
     subset = next(iter(dmcvb_gen.open(request.getfixturevalue(release)).subsets.values()))
     source = subset.source(in_memory=in_memory)
     batch, one = source.gather([]), source.gather([0])
-    assert {name: (value.shape[1:], value.dtype) for name, value in batch.items()} == {
-        name: (value.shape[1:], value.dtype) for name, value in one.items()
-    }
+    kinds = [{name: (value.shape[1:], value.dtype) for name, value in each.items()} for each in (batch, one)]
+    assert kinds[0] == kinds[1]
     assert all(len(value) == 0 for value in batch.values())

@@ -491,9 +491,7 @@ def test_one_checkpoint_of_a_run_is_named_by_its_step(tmp_path, caplog):
     for name, step in (("latest", 1200), ("600", 600)):
         [path] = resolve_policies(WALKER, "expert", f"{run}@{name}")
         assert path == run / "checkpoints" / f"{step:010d}.safetensors"
-    assert [record.getMessage() for record in caplog.records] == [
-        f"{run}@latest is the checkpoint of agent step 1,200."
-    ]
+    assert caplog.messages == [f"{run}@latest is the checkpoint of agent step 1,200."]
     for name in ("700", "first", ""):
         with pytest.raises(DmcvbError, match=rf"no checkpoint '{name}'; give latest, or an agent step .*\[600, 1200\]"):
             resolve_policies(WALKER, "expert", f"{run}@{name}")

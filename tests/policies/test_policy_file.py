@@ -57,9 +57,7 @@ def observations(count=5):
 def test_a_policy_comes_back_as_it_was_saved(policy_path):
     first, second = load_policy(policy_path, get_task("walker-walk")), load_policy(policy_path)
     assert first.header == header_of() == read_header(policy_path) and first.digest == second.digest
-    np.testing.assert_array_equal(
-        first.act(observations(), deterministic=True), second.act(observations(), deterministic=True)
-    )
+    np.testing.assert_array_equal(*(policy.act(observations(), deterministic=True) for policy in (first, second)))
 
 
 def test_actions_are_the_networks_by_hand(policy_path):
@@ -123,9 +121,8 @@ def test_an_action_depends_on_nothing_but_its_own_row(policy_path, deterministic
 
 def test_random_actions_are_uniform_from_each_stream():
     policy = RandomPolicy(get_task("humanoid-walk"))
-    draws = np.concatenate(
-        [policy.act(np.zeros((2, 67)), [np.random.default_rng(i), np.random.default_rng(99)], True) for i in range(400)]
-    )
+    streams = [[np.random.default_rng(seed) for seed in (i, 99)] for i in range(400)]
+    draws = np.concatenate([policy.act(np.zeros((2, 67)), pair, True) for pair in streams])
     assert np.abs(draws).max() <= 1 and draws[::2].std() == pytest.approx(1 / np.sqrt(3), rel=0.02)
     np.testing.assert_array_equal(draws[1], draws[3])
 

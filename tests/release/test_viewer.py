@@ -73,9 +73,8 @@ def test_the_page_plays_scrubs_and_changes_subset(family, light, request, tmp_pa
     if family == "small_release":  # the three distractors share their trajectories
         assert seen["titles"][1] == f"{names[1]}, episode 0" and len(seen["twins"]) == 2
         assert seen["kept"] == [f"{names[2]}, episode 0", f"{names[0]}, episode 0"]
-        assert [text for text in seen["beside"] if text.startswith("same trajectory")] == [
-            f"same trajectory: {other}, episode 0" for other in names[1:]
-        ]
+        twins = [text for text in seen["beside"] if text.startswith("same trajectory")]
+        assert twins == [f"same trajectory: {other}, episode 0" for other in names[1:]]
 
 
 def page_data(path):

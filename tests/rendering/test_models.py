@@ -116,9 +116,7 @@ NATIVE = {f"{geom}, plain" for geom in GEOMS if geom not in ("mesh", "hfield")} 
 def task_of(tmp_path, xml, steps=8, **options):
     """A task of a user's own, and states of two episodes of it: (frame, physics)."""
     (tmp_path / "model.xml").write_text(xml)
-    task = EnvironmentTask(
-        "own:model", lambda: mjcf_environment(tmp_path / "model.xml", lambda physics: 0.0, **options)
-    )
+    task = EnvironmentTask("own:model", lambda: mjcf_environment(tmp_path / "model.xml", lambda _: 0.0, **options))
     batch = task.batch(2)
     batch.reset([np.random.default_rng(seed) for seed in range(2)])
     for _ in range(steps):
@@ -198,7 +196,7 @@ def test_what_an_episode_draws_is_rendered_unless_the_distractor_replaces_it(tmp
     task, physics = task_of(tmp_path, named, steps=0, initialize=draw_episode)
     with caplog.at_level(logging.WARNING):
         assert default_renderer(task) == "opengl"
-    [line] = [record.getMessage() for record in caplog.records]
+    [line] = caplog.messages
     assert "geom_size" in line and "mat_rgba" in line and "\n" not in line
     labels = labels_of(task, physics)
     np.testing.assert_array_equal(drawn("opengl", task, physics, labels), reference(task, physics, draw_looks))
@@ -217,7 +215,7 @@ def test_one_line_says_by_how_much_native_is_off(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(choice, "LARGEST_MEAN", 0.01)
     task, _ = task_of(tmp_path, model())
     assert default_renderer(task) == "opengl"
-    [line] = [record.getMessage() for record in caplog.records]
+    [line] = caplog.messages
     assert re.search(r"own-model is rendered by opengl: native's pictures are \d\.\d grey levels off", line)
 
 
@@ -225,7 +223,7 @@ def test_without_opengl_one_line_says_that_nobody_compared(tmp_path, monkeypatch
     monkeypatch.setattr(opengl, "_started", lambda: (None, "libEGL is missing"))
     task, _ = task_of(tmp_path, model())
     assert default_renderer(task) == "native"
-    [line] = [record.getMessage() for record in caplog.records]
+    [line] = caplog.messages
     assert "without a comparison with MuJoCo's own renderer: libEGL is missing; install libegl1" in line
     with pytest.raises(RenderingError, match="'opengl' cannot start here: libEGL is missing; install"):
         renderer_class("opengl")(task, 64)

@@ -89,12 +89,9 @@ def test_what_is_painted_once_or_in_part_is_what_the_whole_picture_shows(task_id
     """Frames one by one have nothing to share; together, still cameras keep what does not move, pairs share a frame."""
     task, setting, physics, labels = frames_of(task_id, "none")
     renderer = renderer_of("native", task, setting, size)
-    alone = [
-        np.concatenate(
-            [renderer.render(physics[i : i + 1], labels[i : i + 1], None, hide) for i in range(len(physics))]
-        )
-        for hide in (False, True)
-    ]
+    frames = [slice(frame, frame + 1) for frame in range(len(physics))]
+    each = [[renderer.render(physics[at], labels[at], None, hide) for at in frames] for hide in (False, True)]
+    alone = list(map(np.concatenate, each))
     assert (alone[0] != alone[1]).any() == (task_id == MAZE)
     for pictures in (
         renderer.render_pair(physics, labels),

@@ -36,9 +36,8 @@ def frames_of(task_id, setting_name, count=FRAMES):
 
 
 def renderer_of(name, task, setting, size=64, **options):
-    return renderer_class(name)(
-        task, size, backgrounds=load_backgrounds(), floor_alpha=floor_alpha_for(task, setting), **options
-    )
+    floor = floor_alpha_for(task, setting)
+    return renderer_class(name)(task, size, backgrounds=load_backgrounds(), floor_alpha=floor, **options)
 
 
 class RendererTests:

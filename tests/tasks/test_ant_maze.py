@@ -34,9 +34,8 @@ def composer_environment(layout, goal):
     arena = mazes.MazeWithTargets(maze=maze, xy_scale=CELL, z_height=WALL_HEIGHT)
     walker = ant.Ant()
     sphere = target_sphere.TargetSphere(radius=GOAL_RADIUS, height_above_ground=GOAL_HEIGHT)
-    task = random_goal_maze.RepeatSingleGoalMaze(
-        walker, arena, target=sphere, contact_termination=False, aliveness_threshold=-2
-    )
+    endless = dict(contact_termination=False, aliveness_threshold=-2)
+    task = random_goal_maze.RepeatSingleGoalMaze(walker, arena, target=sphere, **endless)
     for observable in task.observables.values():
         if "camera" in str(type(observable)).lower():
             observable.enabled = False

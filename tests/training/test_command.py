@@ -52,9 +52,8 @@ def test_speed_is_meters_a_second_of_the_ants_that_got_there():
 
 @pytest.mark.slow
 def test_mazes_have_scores_of_their_own():
-    assert "to goal m/s" in run(
-        "evaluate-behaviour", "ant-maze-easy7x7a", "walker-walk", "--level", "random", "--episodes", 2
-    )
+    tasks = ("ant-maze-easy7x7a", "walker-walk")
+    assert "to goal m/s" in run("evaluate-behaviour", *tasks, "--level", "random", "--episodes", 2)
 
 
 @pytest.mark.full

@@ -85,9 +85,8 @@ def assert_same_run(first, second):
             torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=0, equal_nan=True)
         else:
             assert ours[name] == theirs[name], name
-    found = [
-        {path.name: load_policy(path) for path in (run.folder / "checkpoints").iterdir()} for run in (first, second)
-    ]
+    folders = [run.folder / "checkpoints" for run in (first, second)]
+    found = [{path.name: load_policy(path) for path in folder.iterdir()} for folder in folders]
     one, other = ({name: policy for name, policy in all.items() if policy.header.evaluation} for all in found)
     assert one.keys() == other.keys() and one
     for name, policy in one.items():

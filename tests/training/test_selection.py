@@ -153,9 +153,8 @@ def test_a_maze_medium_is_nearest_to_the_papers_row_and_there_is_no_mixed():
 @pytest.fixture
 def run_folder(tmp_path):
     """A run of cheetah-run whose checkpoints are random networks, with a made-up learning curve."""
-    header = PolicyHeader(
-        task="cheetah-run", observation_size=17, action_size=6, algorithm="sac", agent_step=0, hidden=(4,)
-    )
+    sizes = {"observation_size": 17, "action_size": 6, "hidden": (4,)}
+    header = PolicyHeader(task="cheetah-run", algorithm="sac", agent_step=0, **sizes)
     for index, value in enumerate(rising(top=6.0, at=20), 1):
         evaluation = Evaluation(mean=float(value), std=1.0, episodes=20, mode="mean", seed=0)
         torch.manual_seed(index)
