@@ -14,13 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 from dmcvb_gen.errors import UnknownNameError
 from dmcvb_gen.text import as_names
-
-if TYPE_CHECKING:
-    from dmcvb_gen.dataset.reader import Subset
 
 ONE_VIEW = ("pixels",)
 """The views of a task with one."""
@@ -85,11 +82,12 @@ def picture_of(array: str) -> tuple[str, bool] | None:
     return view or ONE_VIEW[0], folder == HIDDEN
 
 
-def shown(subset: Subset, views: Sequence[str] | Literal["agents"] | None = None) -> Pictures:
+def shown(subset: Any, views: Sequence[str] | Literal["agents"] | None = None) -> Pictures:
     """The pictures that a subset shows: all its views, in the task's order, the goal hidden if its setting says so;
     whether they are stored or not.
 
     Args:
+      subset: the `Subset`, or another thing with its `record`.
       views: only these views, in this order; "agents": those that agents are trained on, all but the overhead view.
 
     Raises:
