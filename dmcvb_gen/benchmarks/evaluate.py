@@ -416,11 +416,12 @@ def _check_sizes(evaluator: Evaluator, policy: TrainedAgent) -> None:
 
 def _tell_differences(scene: EvaluationScene, evaluator: Evaluator, seen: Mapping[str, Any]) -> None:
     """Log what an evaluation has otherwise than the data that a trained policy learned from."""
-    here: dict[str, Any] = {"task": scene.task}
+    here: dict[str, Any] = {"task": scene.task, "action_repeat": scene.action_repeat}
     if evaluator.renderer is not None:
         here["renderer"] = {"name": scene.renderer, "samples": scene.samples}
     if scene.split == SPLIT and seen.get("backgrounds") and evaluator.videos is not None:
         here["backgrounds"] = evaluator.videos.digest
+    seen = {"action_repeat": ACTION_REPEAT, **seen} if seen else seen
     for name, value in here.items():
         if value != seen.get(name, value):
             _log.warning("the policy's own evaluation has %s %s, this one %s", name, seen[name], value)

@@ -178,7 +178,8 @@ def _verify_bytes(release: Release, everything: bool, tick: ProgressCallback, wo
     expect(tick, len(sample))
     findings += _wrong(release, sample, tick, workers)
     if not everything:
-        findings += _wrong_sizes(release, [file for file in files if file not in sample])
+        read = {file.path for _, file in sample}
+        findings += _wrong_sizes(release, [(place, file) for place, file in files if file.path not in read])
     sound = _sound(release, findings)
     return _verification(release, [subset for subset in sound if len(subset)], findings, (sample, files), sound)
 
