@@ -32,6 +32,8 @@ from dmcvb_gen.storage.store import Store
 
 ATTACHMENTS = (*ATTACHMENT_FILES, f"{CARD_FOLDER}contact_sheet.png", f"{CARD_FOLDER}episodes.parquet")
 """Files that are copied with a release as they are; no digest covers them."""
+BOOKS = (RECORDS, LAYERS, MANIFESTS, PROVENANCE)
+"""Folders of what a release says of its shards and its history; nothing else lies there."""
 TABLE_BYTES, ATTACHMENT_BYTES, NOTES = 2**30, 2**26, 100
 """The largest table of episodes, the largest of the others, and the number of notes of provenance that go along."""
 
@@ -85,11 +87,6 @@ def grows_from(new: Release, old: Release) -> bool:
     return all(record.episodes <= episodes.get(record.name, 0) for record in old.manifest.subsets)
 
 
-def folders_of(release: Release) -> tuple[str, ...]:
-    """Folders that nothing but a release's shards, their lists and their history lies in."""
-    return (RECORDS, LAYERS, MANIFESTS, PROVENANCE, *(f"{layer.group}/" for layer in release.layers.values()))
-
-
 def manifest_at(store: Store, release: Release) -> bytes | None:
     """Return the manifest at a destination: of this release, or of an older one that it has grown from.
 
@@ -112,7 +109,8 @@ def manifest_at(store: Store, release: Release) -> bytes | None:
         )
     ours = {COPY, *(f"{RECIPES}{recipe.sha256}.json" for recipe in (*release.recipes, *_older_recipes(store, release)))}
     ours |= {file.path for file in release.manifest.inputs}
-    folders, found = folders_of(release), list(store.list())
+    folders = (*BOOKS, *(f"{layer.group}/" for layer in release.layers.values()))
+    found = list(store.list())
     others = [path for path in found if path not in ours and not path.startswith(folders)]
     if len(others) < len(found) or not store.writable:  # a try began, or a new repository on the Hub has a README
         others = [path for path in others if not is_attachment(path)]

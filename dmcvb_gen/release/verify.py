@@ -4,7 +4,6 @@ The manifest names lists, lists name files; each is compared with its SHA-256 wh
 a folder, values are checked everywhere, a sample of steps is simulated and a sample of frames rendered.
 """
 
-import contextlib
 import logging
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,9 +20,7 @@ from dmcvb_gen.dataset.manifest import (
     MANIFEST,
     MANIFEST_BYTES,
     MANIFESTS,
-    PROVENANCE,
     RECIPES,
-    RECORDS,
     ZARR_JSON,
     FileRecord,
     build_manifest,
@@ -38,7 +35,7 @@ from dmcvb_gen.errors import BackgroundError, DmcvbError, RenderingError, StoreE
 from dmcvb_gen.options import Location, checked, progress_bar, refuse
 from dmcvb_gen.parallel import Pool, ProgressCallback, Ray, Workers, expect, ignore, in_order
 from dmcvb_gen.release.issue import NOT_PART, UNCHECKED, Issue
-from dmcvb_gen.release.tree import described_files, list_files
+from dmcvb_gen.release.tree import BOOKS, described_files, list_files
 from dmcvb_gen.storage.places import is_url
 
 SAMPLE_FILES = 40
@@ -146,7 +143,8 @@ def verify_folder(
     check_videos_shown(release.manifest.subsets, backgrounds)
     files, findings = _expected(release)
     expect(tick, len(files) + len(release.manifest.subsets))
-    findings += [*_wrong(release, files, tick, THREADS), *_strange(release, files)]
+    findings += _wrong(release, files, tick, THREADS)
+    findings += [found for found in _strange(release, files) if found not in findings]
     if release.text and not release.copy and not findings:
         lists = {layer.name: tuple(release.records(layer.name).values()) for layer in release.manifest.layers}
         built = build_manifest(release.recipes, lists)
@@ -234,8 +232,6 @@ def _expected(release: Release) -> tuple[list[Listed], list[Issue]]:
     names = [record.name for record in release.manifest.subsets if {*record.layers} <= usable]
     try:
         files += [(file.path, file) for file in described_files(release, names)]
-        if release.store.folder:
-            read_recipes(release.store)  # those that the manifest does not name, too
     except StoreError as error:
         findings.append(Issue("files", RECIPES, str(error)))
     if not release.in_the_making and not findings:
@@ -272,14 +268,16 @@ def _wrong_sizes(release: Release, files: Sequence[Listed]) -> list[Issue]:
 
 
 def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
-    """Files that belong to no release."""
+    """Files that belong to no release, and those of its history that were altered."""
     known = {file.path for _, file in files} | {MANIFEST, COPY}
     unplanned = not any(path.endswith(ZARR_JSON) for path in known)  # as something else is damaged
     making = dict(release.layers)
-    with contextlib.suppress(StoreError):  # which was told
-        making |= merged_layers(read_recipes(release.store))
+    try:
+        making |= merged_layers(read_recipes(release.store))  # those that the manifest does not name, too
+    except StoreError as error:
+        yield Issue("files", RECIPES, str(error))
     arrays = tuple(f"{layer.group}/{spec.stored_name}/c/" for layer in making.values() for spec in layer.arrays)
-    folders = (RECORDS, LAYERS, MANIFESTS, RECIPES, PROVENANCE, PREVIEWS, *arrays)
+    folders = (*BOOKS, RECIPES, PREVIEWS, *arrays)
     empty = set() if unplanned else _empty(release)
     for path in release.store.list() if release.manifest_path == MANIFEST else ():
         if path in known or is_attachment(path) or (path.endswith(ZARR_JSON) and unplanned):

@@ -37,7 +37,6 @@ ALGORITHMS = ("A2C", "CrossQ", "DDPG", "PPO", "SAC", "TD3", "TQC", "TRPO")
 NOT_SET = ("self", "policy", "env", "device", "verbose", "seed", "tensorboard_log", "_init_setup_model")
 NOT_SET += ("optimize_memory_usage",)
 """Arguments of an algorithm that the run gives, or that its saved buffer does not know."""
-
 OURS = {"simulations": 8, "normalize_observation": False, "normalize_reward": False}
 KINDS: dict[Any, Any] = {bool: bool, int: Count, float: NonNegative, str: float | str}
 KINDS |= {"gradient_steps": Literal[-1] | Count, "learning_starts": Natural, "top_quantiles_to_drop_per_net": Natural}
@@ -110,7 +109,8 @@ def make_model(run: Run) -> BaseAlgorithm:
     Raises:
       DmcvbError: SB3 does not accept the settings.
     """
-    given = {name: copy.deepcopy(value) for name, value in vars(run.settings).items() if name not in OURS}  # SB3 writes
+    theirs = {name: value for name, value in vars(run.settings).items() if name not in OURS}
+    given = copy.deepcopy(theirs)  # SB3 writes into dicts that it is given
     if isinstance(noise := given.get("action_noise"), int | float):
         given["action_noise"] = NormalActionNoise(np.zeros(run.task.action_size), np.full(run.task.action_size, noise))
     seed = run.config.seed
