@@ -85,16 +85,6 @@ def sin_cos(x) -> tuple[np.ndarray, np.ndarray]:
     return np.where(quarter >= 2, -first, first), np.where((quarter == 1) | (quarter == 2), -second, second)
 
 
-def sin(x) -> np.ndarray:
-    """Sine elementwise."""
-    return sin_cos(x)[0]
-
-
-def cos(x) -> np.ndarray:
-    """Cosine elementwise."""
-    return sin_cos(x)[1]
-
-
 def arctan2(y, x) -> np.ndarray:
     """Angle of (x, y) elementwise, in [-pi, pi]; 0 at the origin."""
     y, x = np.broadcast_arrays(np.asarray(y, np.float64), np.asarray(x, np.float64))

@@ -5,13 +5,14 @@ pydantic checks them. `Annotated` adds what a type alone does not say: bounds, o
 
 from __future__ import annotations
 
+import contextlib
 import contextvars
 import functools
 import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar
 
@@ -79,14 +80,21 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
             given.arguments[name] = _checked(name, value, signature.parameters[name].annotation)
-        try:
+        with naming_parameters():
             return function(*given.args, **given.kwargs)
-        except DmcvbError as error:
-            if not at_terminal.get():
-                error.args = (with_parameters(str(error)), *error.args[1:])
-            raise
 
     return call
+
+
+@contextlib.contextmanager
+def naming_parameters() -> Iterator[None]:
+    """Messages name parameters in place of flags, unless a command runs."""
+    try:
+        yield
+    except DmcvbError as error:
+        if not at_terminal.get():
+            error.args = (with_parameters(str(error)), *error.args[1:])
+        raise
 
 
 def with_parameters(message: str) -> str:

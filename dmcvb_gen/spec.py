@@ -223,7 +223,9 @@ def _strengths(difficulty: str) -> dict[str, float | None]:
     for word in difficulty.split("-"):
         part = next((part for part in ALL_PARTS if word.startswith(part)), "")
         number = word[len(part) :]
-        if not part or part in found or word == CUE:
+        if word == CUE:
+            raise DmcvbError(f"distractor part {CUE} needs its correlation with the action, e.g. {CUE}0.8")
+        if not part or part in found:
             raise UnknownNameError("difficulty", difficulty, DIFFICULTIES)
         if part == "background":
             if number not in ("", ALL) and not re.fullmatch("0*[1-9][0-9]{0,8}", number):

@@ -11,10 +11,9 @@ from dmcvb_gen import arithmetic
 GRID = np.random.default_rng(0).normal(size=20_000) * np.repeat([1e-8, 0.01, 1.0, 30.0], 5000)
 
 
-@pytest.mark.parametrize("name", ["exp", "sin", "cos"])
-def test_functions_are_numpys_to_the_last_bits(name):
-    ours, theirs = getattr(arithmetic, name)(GRID), getattr(np, name)(GRID)
-    np.testing.assert_allclose(ours, theirs, rtol=2e-15, atol=2e-16)
+def test_exp_and_sin_cos_are_numpys_to_the_last_bits():
+    np.testing.assert_allclose(arithmetic.exp(GRID), np.exp(GRID), rtol=2e-15, atol=2e-16)
+    np.testing.assert_allclose(arithmetic.sin_cos(GRID), (np.sin(GRID), np.cos(GRID)), rtol=2e-15, atol=2e-16)
 
 
 def test_tanh_log_and_arctan2_are_numpys():

@@ -70,6 +70,7 @@ class DistractorSampler:
                 found.update(nominal.nominal(self._scene, physics))
             for distractor in self._drawn:
                 found.update(distractor.labels(physics, frames))
+            found = {name: np.array(values) for name, values in found.items()}  # `adjust` may write into them
             for distractor in self._drawn:
                 distractor.adjust(found, actions, frames)
             if self.own:
@@ -107,6 +108,8 @@ class DistractorSampler:
                     f"distractor {self.own} gives {name} as {values.dtype} of shape {values.shape}; give numbers of "
                     f"shape {shape}"
                 )
+            if name == "camera_quaternion" and not values.any(axis=-1).all():
+                raise DmcvbError(f"distractor {self.own} gives a camera_quaternion of zeros, which is no rotation")
             low, high = self._range(name, found)
             if not ((low <= values) & (values <= high)).all():  # NaN is in no range
                 raise DmcvbError(

@@ -18,7 +18,7 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageSequence
+from PIL import Image, ImageOps, ImageSequence
 
 from dmcvb_gen.errors import BackgroundError, first_line
 
@@ -32,8 +32,9 @@ DECODING_SECONDS = 600
 """Seconds that a video may take to decode."""
 CACHE_BYTES = 256 * 2**20
 """Decoded frames that an open source keeps (and always the video asked for last)."""
-PICTURES = {".png", ".jpg", ".jpeg", ".bmp"}
-VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".gif", ".webp"}
+PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
+VIDEOS = {".mp4", ".m4v", ".avi", ".mov", ".mkv", ".mpg", ".mpeg", ".ts", ".wmv", ".flv", ".ogv", ".webm"}
+VIDEOS |= {".gif", ".webp"}
 _SPLITS = {"train": ("train", "training"), "val": ("val", "validation", "test")}
 
 
@@ -208,7 +209,8 @@ def _read_pictures(path: Path) -> np.ndarray:
             raise ValueError(f"{picture.width} x {picture.height} is more than {MAX_PIXELS:,} pixels")
         most = 1 if path.suffix.lower() in PICTURES else MAX_FRAMES  # some photos hold two; a hostile file has no end
         frames = itertools.islice(ImageSequence.Iterator(picture), most)
-        return np.stack([square(_eight_bits(frame).convert("RGB")) for frame in frames])
+        upright = (ImageOps.exif_transpose(frame) for frame in frames)
+        return np.stack([square(_eight_bits(frame).convert("RGB")) for frame in upright])
 
 
 def _eight_bits(picture: Image.Image) -> Image.Image:

@@ -13,6 +13,7 @@ import numpy as np
 
 from dmcvb_gen import arithmetic
 from dmcvb_gen.distractors.base import Distractor, DistractorSetting, Scene
+from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks.base import ACTION_REPEAT
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, nominal_cameras, quaternions
 
@@ -163,7 +164,7 @@ def look_at(offset: np.ndarray, roll: np.ndarray) -> np.ndarray:
 
 
 class Camera(Distractor):
-    """One camera around the agent; without it, the cameras of the task's views."""
+    """The first view's camera moves around the agent; the others, and without it all, are the task's own."""
 
     kinds = ("static", "dynamic")
     stream = "camera"
@@ -172,6 +173,8 @@ class Camera(Distractor):
     def __init__(self, scene: Scene, generators: Sequence[np.random.Generator]):
         self._task, model, camera = scene.task, scene.task.model, camera_ids(scene.task)[0]
         offset, rotation = np.asarray(model.cam_poscom0[camera]), model.cam_mat0[camera].reshape(3, 3)
+        if not arithmetic.norm(offset) > 0:
+            raise DmcvbError(f"{scene.task.id} has its camera in the agent's center; let others than camera vary")
         overhead = bool(abs(offset[2]) > OVERHEAD * arithmetic.norm(offset))
         if overhead:  # walk as if the nominal image stood upright: right is x, into the image y, up z
             axes = np.stack([rotation[:, 0], -rotation[:, 2], rotation[:, 1]], axis=1)
@@ -187,10 +190,11 @@ class Camera(Distractor):
 
     def labels(self, physics: np.ndarray, frames: int | slice) -> Mapping[str, np.ndarray]:
         agent = centers_of_mass(self._task, physics)
-        return {
-            "camera_position": (agent + self._offset[:, frames])[..., None, :],
-            "camera_quaternion": self._quaternion[:, frames][..., None, :],
-        }
+        moved = [(agent + self._offset[:, frames])[..., None, :], self._quaternion[:, frames][..., None, :]]
+        if len(self._task.views) > 1:
+            own = (values[..., 1:, :] for values in nominal_cameras(self._task, physics))
+            moved = [np.concatenate(pair, axis=-2) for pair in zip(moved, own, strict=True)]
+        return dict(zip(self.names, moved, strict=True))
 
     @classmethod
     def nominal(cls, scene: Scene, physics: np.ndarray) -> Mapping[str, np.ndarray]:

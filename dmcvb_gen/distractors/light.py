@@ -27,6 +27,6 @@ class Light(Distractor):
         heights = model.light_pos[model.light_active.astype(bool), 2]
         if not len(heights):
             raise DmcvbError(f"{scene.task.id} has no lamp, so its light cannot vary; remove light")
-        most = RANGE * scene.setting.scale_of("light") * (float(heights.max()) or 1.0)
+        most = RANGE * scene.setting.scale_of("light") * (abs(float(heights.max())) or 1.0)
         place = (2 * np.stack([rng.random(3) for rng in generators]) - 1) * most
         self.drawn = {"light_shift": bounded_walk(scene, generators, place, -most, most, STEP_STD * most)}

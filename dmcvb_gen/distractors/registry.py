@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import metadata
 from typing import Any
 
-from dmcvb_gen import own_code, seeding
+from dmcvb_gen import own_code
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, OPTIONAL_LABELS
 from dmcvb_gen.distractors.background import Background
 from dmcvb_gen.distractors.base import Distractor
@@ -19,6 +19,7 @@ from dmcvb_gen.distractors.cue import Cue
 from dmcvb_gen.distractors.light import Light
 from dmcvb_gen.distractors.style import Style
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.seeding import DISTRACTOR_STREAMS
 from dmcvb_gen.spec import DISTRACTOR_ENTRY_POINTS, DISTRACTOR_KINDS, DistractorSetting, kind_of
 
 BUILT_IN: tuple[type[Distractor], ...] = (Camera, Color, Background, Style, Cue, Light)
@@ -77,6 +78,6 @@ def _checked(distractor: Any, kind: str) -> type[Distractor]:
         )
     known = [name for name in DISTRACTOR_STATE_NAMES if name not in OPTIONAL_LABELS]
     names, stream = (getattr(distractor, name, None) for name in ("names", "stream"))
-    if names is None or not set(names) <= set(known) or stream not in seeding.STREAMS:
-        raise DmcvbError(f"{distractor!r}: give names out of {known}, and a stream out of {seeding.STREAMS}")
+    if names is None or not set(names) <= set(known) or stream not in DISTRACTOR_STREAMS:
+        raise DmcvbError(f"{distractor!r}: give names out of {known}, and a stream out of {DISTRACTOR_STREAMS}")
     return distractor

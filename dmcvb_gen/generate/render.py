@@ -5,7 +5,6 @@ The engine, the checks and the readers that render on demand share it.
 
 from __future__ import annotations
 
-import atexit
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
@@ -46,10 +45,16 @@ def open_renderer(
 
     Args:
       backgrounds: "builtin" or a folder of videos.
+
+    Raises:
+      RenderingError: it cannot start here, or shows no videos on this task.
     """
     videos = videos_of(setting, backgrounds, split)
     floor = floor_alpha_for(task, setting)
-    return renderer_class(name)(task, size, backgrounds=videos, floor_alpha=floor, samples=samples), videos
+    renderer = renderer_class(name)(task, size, backgrounds=videos, floor_alpha=floor, samples=samples)
+    if setting.varies("background"):
+        renderer.check_sky()
+    return renderer, videos
 
 
 def renderer_for(record: SubsetRecord, backgrounds: str) -> tuple[Renderer, Any]:
@@ -78,8 +83,6 @@ class RendererCache:
             if len(self._made) == MOST_RENDERERS or any(task != record.task for task, *_ in self._made):
                 self.close()
             self._made[key] = renderer_for(record, backgrounds)[0]
-            atexit.unregister(self.close)
-            atexit.register(self.close)  # now, before OpenGL's library ends: it may have come with this renderer
         return self._made[key]
 
     def close(self) -> None:

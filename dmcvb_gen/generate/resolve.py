@@ -54,6 +54,7 @@ from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.environment import model_digest
+from dmcvb_gen.text import pluralize
 
 _log = logging.getLogger(__name__)
 
@@ -355,6 +356,9 @@ def rendering_facts(record: SubsetRecord, backgrounds: str) -> dict[str, Any]:
     facts = {name: value for name, value in renderer.describe().items() if name != "mujoco"}  # provenance has it
     renderer.close()
     shown = None
+    if videos and (asked := record.distractor.videos or 0) > len(videos):
+        name, there = record.distractor.name, pluralize(len(videos), "videos")
+        _log.warning(f"{name} shows {there}, not {asked}: {backgrounds} has no more for split {record.split}")
     if videos:
         source = BUILTIN if backgrounds == BUILTIN else f"{VIDEOS}{videos.digest[:16]}"
         shown = {"source": source, "split": record.split, "digest": videos.digest}

@@ -26,6 +26,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import check_renderer, look, open_renderer
 from dmcvb_gen.generate.request import background_source
+from dmcvb_gen.options import naming_parameters
 from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import VISIBLE, GoalMode, SubsetSpec, is_maze
@@ -155,6 +156,7 @@ class _Stage:
                 f"{scene.backgrounds} has other videos than the data ({scene.own_videos[:12]}); give theirs"
             )
         self.batch = self.task.batch(count, scene.threads)
+        self.batch.alone = False
         self._episodes = [(0, 0)] * count  # (seed, number) of each place
         self.frame, self.started = np.zeros(count, int), np.zeros(count, int)
         self.action = np.zeros((count, self.task.action_size))  # the last one
@@ -293,7 +295,8 @@ class DistractedEnv(gymnasium.Env):
     def __init__(self, task: str, distractor: str = "none", *, render_mode: str | None = None, **options: Any):
         if render_mode not in (None, "rgb_array"):
             raise DmcvbError(f"render_mode {render_mode!r} is not offered; give 'rgb_array' or None")
-        self._stage = _Stage(1, _scene(task, distractor, options))
+        with naming_parameters():
+            self._stage = _Stage(1, _scene(task, distractor, options))
         self.task, self.render_mode = self._stage.task, render_mode
         self.observation_space, self.action_space = self._stage.spaces()
         self.metadata = self.metadata | {"render_fps": round(1 / self.task.seconds_per_step)}
@@ -347,7 +350,8 @@ class DistractedVectorEnv(VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 20}
 
     def __init__(self, num_envs: int, task: str, distractor: str = "none", **options: Any):
-        self._stage = _Stage(num_envs, _scene(task, distractor, options))
+        with naming_parameters():
+            self._stage = _Stage(num_envs, _scene(task, distractor, options))
         self.num_envs, self.task, self.render_mode = num_envs, self._stage.task, None
         self.single_observation_space, self.single_action_space = self._stage.spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -366,8 +370,8 @@ class DistractedVectorEnv(VectorEnv):
         if options and "reset_mask" in options:
             raise DmcvbError("places restart by themselves, a step after their end; leave reset_mask out")
         if seed is not None or self._seeds is None:
-            given = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
-            given = [None] * self.num_envs if given is None else list(given)
+            given = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+            given = [None] * self.num_envs if given is None else [each if each is None else int(each) for each in given]
             if len(given) != self.num_envs:
                 raise DmcvbError(f"{len(given)} seeds are given for {self.num_envs} environments; give one for each")
             self._seeds = [int(gymnasium.utils.seeding.np_random(value)[0].integers(2**63)) for value in given]

@@ -144,7 +144,10 @@ def convert(
         raise PolicyFileError(f"{path} does not say how the policy acts; give the .zip of Stable-Baselines3's save()")
     if distribution is not None and layout.distribution is not None:
         raise PolicyFileError(f"--actions has no effect: the actions of {path} are known; remove it")
-    activation = activation or (facts and facts.activation) or layout.activation
+    known = (facts and facts.activation) or layout.activation
+    if facts and known and activation not in (None, known):
+        raise PolicyFileError(f"--activation has no effect: that of {path} is known, {known}; remove it")
+    activation = activation or known
     distribution = layout.distribution or distribution
     if activation is None or distribution is None:
         raise PolicyFileError(

@@ -60,6 +60,10 @@ class Renderer(abc.ABC):
         """Raise RenderingError if this renderer does not paint a task; most paint every one."""
         return
 
+    def check_sky(self) -> None:
+        """Raise RenderingError if this renderer cannot show videos on its task; most can."""
+        return
+
     @abc.abstractmethod
     def render(
         self, physics: np.ndarray, exogenous: DistractorState, views: Views = None, hide_goal: bool = False

@@ -6,6 +6,7 @@ step has one render, and kinematics no physics step.
 
 from __future__ import annotations
 
+import atexit
 import copy
 import ctypes.util
 import functools
@@ -13,13 +14,14 @@ import importlib
 import os
 import subprocess
 import sys
+import weakref
 from typing import Any
 
 import mujoco
 import numpy as np
 from PIL import Image
 
-from dmcvb_gen.errors import RenderingError
+from dmcvb_gen.errors import RenderingError, first_line
 from dmcvb_gen.rendering.base import Renderer, check_frames, empty_labels, moved_lamps
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
@@ -75,6 +77,12 @@ def _painter(model: mujoco.MjModel, size: int) -> mujoco.Renderer:
         module.gl_context.GLContext = chosen
 
 
+def _close(painter: mujoco.Renderer) -> None:
+    if painter._gl_context:
+        painter._gl_context.make_current()  # MuJoCo frees what the current one has
+    painter.close()
+
+
 class OpenglRenderer(Renderer):
     """Renderer by MuJoCo's OpenGL."""
 
@@ -102,13 +110,20 @@ class OpenglRenderer(Renderer):
         self._own_values = {name: getattr(self._model, name).copy() for name in _REPLACED}
         self._data = mujoco.MjData(self._model)
         self._painter = _painter(self._model, size)
+        self._free = weakref.finalize(self, _close, self._painter)
+        self._free.atexit = False
+        atexit.register(self._free)  # now, before OpenGL's library ends: it may have come with this renderer
+        if (given := self._painter._mjr_context.offSamples) != self.samples:
+            raise RenderingError(
+                f"OpenGL gives {given} samples a pixel here, not {self.samples}; ask for --samples {given}"
+            )
         self._terrain_changes = task.draws_terrain or "hfield_data" in task.model_entries
         self._shown: tuple[int, int] = (-1, -1)
 
     def render(self, physics, exogenous, views=None, hide_goal=False):
         indices = check_frames(self.task, physics, exogenous, views)
         out = np.empty((len(physics), len(indices), self.size, self.size, 3), np.uint8)
-        self._painter._gl_context.make_current()
+        self._take_context()
         rotations = matrices(exogenous.camera_quaternion.astype(np.float64))
         # Frames with the same background follow each other: a texture is uploaded once.
         order = np.lexsort((exogenous.background_frame, exogenous.background_video))
@@ -121,7 +136,7 @@ class OpenglRenderer(Renderer):
     def render_labels(self, physics, exogenous, views=None, hide_goal=False):
         indices = check_frames(self.task, physics, exogenous, views)
         depth, segmentation = empty_labels(len(physics), len(indices), self.size)
-        self._painter._gl_context.make_current()
+        self._take_context()
         rotations = matrices(exogenous.camera_quaternion.astype(np.float64))
         for frame in range(len(physics)):
             self._pose(physics[frame], exogenous, frame, hide_goal)
@@ -134,6 +149,21 @@ class OpenglRenderer(Renderer):
                 depth[frame, column] = np.where(kind < 0, 0, meters)
         self._painter.disable_depth_rendering()
         return {"depth": depth, "segmentation": segmentation}
+
+    def check_sky(self) -> None:
+        if self._sky < 0:
+            raise RenderingError(
+                f'{self.task.id} has no sky to show a video on; add a texture of type="skybox" to its model, or leave '
+                "the background out of what varies"
+            )
+
+    def _take_context(self) -> None:
+        try:
+            self._painter._gl_context.make_current()
+        except Exception as error:  # EGL's own kinds
+            raise RenderingError(
+                f"OpenGL does not draw here ({first_line(error)}); make an environment in the thread that uses it"
+            ) from None
 
     def _pose(self, physics, exogenous, frame, hide_goal):
         """Set the frame's state, then the model as its episode has it, then what its labels say."""
@@ -161,11 +191,8 @@ class OpenglRenderer(Renderer):
 
     def _show_background(self, video: int, frame: int) -> None:
         """Put a video frame on the sky: a square texture, which MuJoCo repeats on the six faces."""
-        if self._sky < 0 and video >= 0:
-            raise RenderingError(
-                f'{self.task.id} has no sky to show a video on; add a texture of type="skybox" to its model, or leave '
-                "the background out of what varies"
-            )
+        if video >= 0:
+            self.check_sky()
         if self._sky < 0 or (video, frame) == self._shown:
             return
         if video < 0:
@@ -193,13 +220,7 @@ class OpenglRenderer(Renderer):
         return self._painter.render()
 
     def close(self) -> None:
-        if self._painter._gl_context:
-            self._painter._gl_context.make_current()  # MuJoCo frees what the current one has
-        self._painter.close()
-
-    def __del__(self) -> None:
-        if hasattr(self, "_painter"):
-            self.close()
+        self._free()
 
 
 RENDERER = OpenglRenderer

@@ -259,7 +259,14 @@ def field_owner(model: mujoco.MjModel, name: str) -> tuple[Any, str]:
 
 
 class EpisodeBatch(abc.ABC):
-    """`size` episodes of one task, simulated together. A simulation never influences its neighbors."""
+    """`size` episodes of one task, simulated together. A simulation never influences its neighbors.
+
+    Attributes:
+      alone: False if other threads may run beside it: whether a user's task draws from global generators is not seen
+        then.
+    """
+
+    alone = True
 
     def __init__(self, task: Task, size: int):
         self.task = task

@@ -11,6 +11,7 @@ import copy
 import functools
 import hashlib
 import math
+import operator
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -133,7 +134,9 @@ class EnvironmentTask(Task):
         episode.reset(seed)
         if episode.terrain != key:
             raise self.error("draws other terrain than is stored; install dm_control, numpy and scipy as they were")
-        return episode.model.hfield_data.copy()
+        heights = episode.model.hfield_data.copy()
+        episode.close()
+        return heights
 
     def at(self, action_repeat: int) -> Task:
         other = super().at(action_repeat)
@@ -172,6 +175,9 @@ class EnvironmentTask(Task):
             probes += [_Probe(self, self.make_environment(seed), seed) for seed in (second, second, first)]
         if not self.trusted:
             self._check_probes(probes)
+        with starting(self.id):
+            for probe in probes:
+                probe.environment.close()
         start, assets = probes[0].models[0], probes[0].assets
         changed = {name for probe in probes for name in probe.changed(start)}
         self._fixed = {name: value for name, value in start.items() if not self.trusted and name not in changed}
@@ -191,6 +197,15 @@ class EnvironmentTask(Task):
     def _check_probes(self, probes: Sequence[_Probe]) -> None:
         """Refuse a task whose episodes do not follow from their seeds."""
         one, two, two_again, one_again = probes
+        parts = ["task", "physics", "physics.data.ptr"]
+        if any(probe.changed(one.models[0]) for probe in probes):
+            parts.append("physics.model.ptr")
+        for part in parts:
+            if len({id(operator.attrgetter(part)(probe.environment)) for probe in probes}) < len(probes):
+                raise DmcvbError(
+                    f"{self.id} gives environments that share their {part.removesuffix('.ptr')}, and episodes run side "
+                    "by side; make a new one in each call"
+                )
         if set(one.held) & set(two.held):
             raise DmcvbError(
                 f"{self.id} holds a random generator with a fixed seed, which begins every episode alike; draw from "
@@ -376,7 +391,7 @@ class _Episode:
         return np.concatenate([self.full_state(), *entries, self.terrain if self.task.draws_terrain else ()])
 
     def put(self, row: np.ndarray) -> None:
-        """Put the simulation into a stored row; what the task keeps in Python stays as it is."""
+        """Put the simulation into a stored row; what the task keeps in Python, and last observed, stays as it is."""
         physics, spec = self.environment.physics, self.task.physics_spec
         with self._told():
             self.task.apply_entries(self.model, row)
@@ -384,7 +399,13 @@ class _Episode:
             physics.reset()
             physics.set_state(row[: mujoco.mj_stateSize(self.task.model, spec)], spec)
             physics.after_reset()
-            self._observe(None if self.task.trusted else self.environment.task.get_observation(physics))
+            if self.task.trusted:
+                self._observe(None)
+
+    def close(self) -> None:
+        """Let go of what the environment holds."""
+        with self._told():
+            self.environment.close()
 
     def error(self, reason: str) -> EpisodeError:
         return EpisodeError(self.task.id, self.place, self.steps, reason)
@@ -467,6 +488,8 @@ class EnvironmentBatch(EpisodeBatch):
 
     def _begin(self, sim: int, seed: int) -> _Episode:
         """A new episode in a place, in an environment of its own."""
+        if before := self._episodes[sim]:
+            before.close()
         episode = self._episodes[sim] = _Episode(self.task, self.task.make_environment(seed), sim)
         episode.reset(seed)
         return episode
@@ -482,7 +505,10 @@ class EnvironmentBatch(EpisodeBatch):
         return np.array([self._running(sim).row() for sim in range(self.size)])
 
     def set_physics(self, physics, ids=None):
-        """See `EpisodeBatch`; what a task keeps in Python stays as it is, so it may go on in another way."""
+        """See `EpisodeBatch`; what a task keeps in Python stays as it is, so it may go on in another way.
+
+        A user's own task observes again with its next step, as its environment's `step` gives it.
+        """
         ids = self._all if ids is None else np.asarray(ids, int)
         for sim, row in zip(ids.tolist(), np.asarray(physics, np.float64), strict=True):
             self._running(sim).put(row)
@@ -494,7 +520,7 @@ class EnvironmentBatch(EpisodeBatch):
         moving = self._all if active is None else np.flatnonzero(active)
         episodes = [episode for sim in moving.tolist() if not (episode := self._running(sim)).over]
         terminated, truncated = np.zeros((2, self.size), bool)
-        with contextlib.nullcontext() if self.task.trusted else watched(self.task.error):
+        with contextlib.nullcontext() if self.task.trusted else watched(self.task.error, self.alone):
             for episode in episodes:
                 sim = episode.place
                 reward[sim], discount[sim] = episode.step(actions[sim])

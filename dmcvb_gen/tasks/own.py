@@ -17,6 +17,7 @@ import numpy as np
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.own_code import TASKS, find_function
 from dmcvb_gen.tasks.base import Task
+from dmcvb_gen.tasks.cameras import camera_ids
 from dmcvb_gen.tasks.environment import EnvironmentTask, starting
 from dmcvb_gen.tasks.suite import import_quietly
 
@@ -43,15 +44,23 @@ def _of_class(task_id: str, kind: type[Task]) -> Task:
             task.return_range = (-math.inf, math.inf)  # not its parent's
         for name in Task.__annotations__.keys() - vars(Task).keys():
             getattr(task, name)
+        cameras = camera_ids(task)
+        if len(cameras) != len(task.views) or not all(0 <= camera < task.model.ncam for camera in cameras):
+            raise DmcvbError(
+                f"{task_id} has views {task.views} and cameras {task.cameras}, and its model has {task.model.ncam}; "
+                "name a camera of the model for each view"
+            )
+        if not isinstance(task.max_steps, int):
+            raise DmcvbError(f"{task_id} has max_steps {task.max_steps!r}; give an int")
         batch = task.batch(2)
         batch.reset([np.random.default_rng(place) for place in range(2)])
         for _ in range(2):
-            batch.step(task.from_unit(np.zeros((2, task.action_size), np.float32)))
-        if batch.state().shape != (2, task.state_size):
-            raise DmcvbError(
-                f"{task_id} gives states of shape {batch.state().shape}; let them have the sizes of state_fields: "
-                f"(2, {task.state_size})"
-            )
+            result = batch.step(task.from_unit(np.zeros((2, task.action_size), np.float32)))
+        shapes = {name: np.shape(value) for name, value in vars(result).items()}
+        for name, shape in [*shapes.items(), ("state", batch.state().shape)]:
+            wanted = (2, task.state_size) if name == "state" else (2,)
+            if shape != wanted:
+                raise DmcvbError(f"{task_id} gives {name} of shape {shape} for two simulations; let it be {wanted}")
     return task
 
 

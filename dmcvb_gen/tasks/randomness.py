@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import gc
 import random
+import threading
 import types
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -14,31 +16,36 @@ from numpy.random import bit_generator
 
 OBJECTS = 100_000
 """Objects of a task that are searched for generators, at most."""
+_ALONE = threading.RLock()
+"""Held while the global generators are seeded, which all threads share."""
+_NUMPY: Any = bit_generator  # whose name for `secrets.randbits` gives generators without a seed their entropy
+_entropy: ContextVar[Callable[[int], int]] = ContextVar("entropy", default=_NUMPY.randbits)
+_NUMPY.randbits = lambda bits: _entropy.get()(bits)
 
 
 @contextlib.contextmanager
-def _entropy(bits: Callable[[int], int]) -> Iterator[None]:
-    """Numpy's generators that are made without a seed take it from `bits` instead of from the operating system."""
-    source: Any = bit_generator  # its name for `secrets.randbits`
-    kept, source.randbits = source.randbits, bits
+def _entropy_from(bits: Callable[[int], int]) -> Iterator[None]:
+    """This thread's generators that are made without a seed take it from `bits`, not from the operating system."""
+    token = _entropy.set(bits)
     try:
         yield
     finally:
-        source.randbits = kept
+        _entropy.reset(token)
 
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """The global generators, and those of numpy that are made without a seed meanwhile, follow from `seed`."""
-    kept, source = (np.random.get_state(legacy=False), random.getstate()), random.Random(seed)
-    np.random.seed(source.getrandbits(32))
-    random.seed(source.getrandbits(64))
-    try:
-        with _entropy(source.getrandbits):
-            yield
-    finally:
-        np.random.set_state(kept[0])
-        random.setstate(kept[1])
+    with _ALONE:
+        kept, source = (np.random.get_state(legacy=False), random.getstate()), random.Random(seed)
+        np.random.seed(source.getrandbits(32))
+        random.seed(source.getrandbits(64))
+        try:
+            with _entropy_from(source.getrandbits):
+                yield
+        finally:
+            np.random.set_state(kept[0])
+            random.setstate(kept[1])
 
 
 def seed_task(task: Any, seed: int) -> None:
@@ -54,18 +61,22 @@ def seed_task(task: Any, seed: int) -> None:
 
 
 @contextlib.contextmanager
-def watched(complain: Callable[[str], Exception]) -> Iterator[None]:
-    """Raise what `complain` makes of a reason if code draws from a global generator, or makes one without a seed."""
+def watched(complain: Callable[[str], Exception], alone: bool = True) -> Iterator[None]:
+    """Raise what `complain` makes of a reason if code draws from a global generator, or makes one without a seed.
+
+    Args:
+      alone: False if other threads may draw from the global generators meanwhile, which are not looked at then.
+    """
 
     def refuse(count: int) -> int:
         raise complain("made a random generator without a seed in a step; draw from self.random")
 
     before = np.random.get_state(legacy=False)["state"], random.getstate()
-    with _entropy(refuse):
+    with _entropy_from(refuse):
         yield
     after = np.random.get_state(legacy=False)["state"], random.getstate()
     same = before[0]["pos"] == after[0]["pos"] and np.array_equal(before[0]["key"], after[0]["key"])
-    if not same or before[1] != after[1]:
+    if alone and (not same or before[1] != after[1]):
         raise complain("drew from a global random generator in a step; draw from self.random")
 
 

@@ -163,6 +163,15 @@ def test_images_of_sixteen_bits_keep_their_brightness(tmp_path):
     assert np.abs(frame - np.arange(256)[None, :, None]).max() <= 1
 
 
+def test_photos_are_turned_as_they_say(tmp_path):
+    picture = Image.fromarray(np.repeat(np.uint8([[[0], [255]]]), 3, axis=2).repeat(64, 0).repeat(32, 1))
+    turned = picture.getexif()
+    turned[0x0112] = 6
+    picture.save(tmp_path / "a.tif", exif=turned)
+    frame = load_backgrounds(tmp_path).frames(0)[0].astype(int)
+    assert frame[:100].mean() < 10 and frame[-100:].mean() > 245
+
+
 def test_a_missing_decoder_says_what_to_install(tmp_path, monkeypatch):
     write_video(tmp_path / "a.mp4", clip())
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import ks_2samp, kstest
 
-from dmcvb_gen.distractors import Distractor, DistractorSetting, load_backgrounds, sample_distractors
+from dmcvb_gen.distractors import Distractor, DistractorSampler, DistractorSetting, load_backgrounds, sample_distractors
 from dmcvb_gen.distractors.background import ping_pong
 from dmcvb_gen.distractors.camera import CameraRange, camera_range, camera_walk, spherical
 from dmcvb_gen.errors import DmcvbError
@@ -17,6 +19,7 @@ from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
+from dmcvb_gen.tasks.locomotion import WalkerWalk
 
 
 def physics_of(task, episodes=2, frames=41):
@@ -269,6 +272,86 @@ def test_a_distractor_of_ones_own_that_gives_other_labels_than_it_should_is_name
     with pytest.raises(DmcvbError, match=words) as caught:
         labels(task, "own", physics)
     assert str(caught.value).startswith(f"distractor {__name__}:Own ") and "\n" not in str(caught.value)
+
+
+class Halved(Own):
+    """Halves what it drew, in place."""
+
+    def adjust(self, found, actions, frames):
+        found["material_rgb"] *= 0.5
+
+
+class Unturned(Own):
+    names = ("camera_position", "camera_quaternion")
+
+    def labels(self, physics, frames):
+        return {name: np.zeros((*physics.shape[:-1], 1, size)) for name, size in zip(self.names, (3, 4), strict=True)}
+
+
+class Steered(Own):
+    stream = "policy"
+
+
+def test_a_distractor_of_ones_own_may_write_into_the_labels_that_it_is_given(monkeypatch):
+    monkeypatch.setenv(DISTRACTORS, f"{__name__}:Halved")
+    monkeypatch.setattr(Halved, "kinds", ("halved",))
+    task, setting = get_task("walker-walk"), DistractorSetting.parse("halved")
+    sampler = DistractorSampler(task, setting, 4, generators(range(2)), load_backgrounds())
+    once, again = (sampler.labels(physics_of(task, 2, 1)[:, 0], frame=3).material_rgb for _ in range(2))
+    np.testing.assert_array_equal(once, again)
+    assert 0.45 < once.max() <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [(Unturned, "gives a camera_quaternion of zeros, which is no rotation"), (Steered, "a stream out of .'camera'")],
+)
+def test_a_distractor_of_ones_own_that_cannot_be_is_refused(kind, words, monkeypatch):
+    name = kind.__name__.lower()
+    monkeypatch.setenv(DISTRACTORS, f"{__name__}:{kind.__name__}")
+    monkeypatch.setattr(kind, "kinds", (name,))
+    with pytest.raises(DmcvbError, match=words):
+        labels(get_task("walker-walk"), name, physics_of(get_task("walker-walk"), 2, 3))
+
+
+class Odd(WalkerWalk):
+    """Two views, lamps below, actions from 0 to 1."""
+
+    views, cameras = ("side", "back"), (0, 1)
+    action_low = np.zeros(6, np.float32)
+
+    def __init__(self):
+        super().__init__()
+        self.model = copy.deepcopy(self.model)
+        self.model.light_pos[:, 2] *= -1
+
+
+def test_one_view_is_moved_and_the_others_are_the_tasks_own():
+    task, walker = Odd(), get_task("walker-walk")
+    physics = physics_of(walker, 2, 5)
+    found, single = labels(task, "dynamic", physics), labels(walker, "dynamic", physics)
+    own = dict(zip(("camera_position", "camera_quaternion"), nominal_cameras(task, physics), strict=True))
+    for name, values in own.items():
+        np.testing.assert_array_equal(getattr(found, name)[..., :1, :], getattr(single, name))
+        np.testing.assert_array_equal(getattr(found, name)[..., 1:, :], values[..., 1:, :])
+
+
+def test_lamps_below_move_as_those_above_and_cues_follow_actions_of_other_bounds():
+    task, walker = Odd(), get_task("walker-walk")
+    physics, actions = physics_of(walker, 2, 5), np.tile([[0.9], [0.1], [0.7], [0.2], [0.6]], (2, 1, 6))
+    shifts = [labels(each, "dynamic_light0.5", physics).light_shift for each in (task, walker)]
+    np.testing.assert_array_equal(*shifts)
+    setting = DistractorSetting.parse("dynamic_cue1")
+    shown = sample_distractors(task, setting, physics, generators(range(2)), None, actions=actions).material_rgb
+    lighter = shown.mean(axis=(2, 3)) > task.material_colors.mean()
+    np.testing.assert_array_equal(lighter, actions[..., 0] > 0.5)
+
+
+def test_a_camera_in_the_agents_center_cannot_move_around_it():
+    task = Odd()
+    task.model.cam_poscom0[:] = 0
+    with pytest.raises(DmcvbError, match="has its camera in the agent's center; let others than camera vary"):
+        labels(task, "dynamic", physics_of(get_task("walker-walk"), 2, 2))
 
 
 def test_difficulty_decides_how_many_videos_are_in_play():

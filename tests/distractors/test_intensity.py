@@ -54,7 +54,7 @@ def test_a_setting_says_what_varies_and_how_much():
     ],
 )
 def test_numbers_out_of_range_and_cues_that_cannot_be_are_refused(name):
-    with pytest.raises(DmcvbError):
+    with pytest.raises(DmcvbError, match="e.g. cue0.8" if name == "dynamic_cue" else None):
         DistractorSetting.parse(name)
 
 

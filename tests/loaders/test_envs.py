@@ -187,6 +187,7 @@ MISTAKES = [
     ((MAZE, "fixed"), {"goal_pair": 7, "fixed_goals": 3}, "goal_pair is 7; give 0 to 2"),
     ((MAZE, "visible"), {"views": ()}, "views is empty"),
     (("walker-walk",), {"modalities": "flow"}, "has no flow"),
+    (("dog-walk",), {}, "does not paint; use renderer opengl"),
 ]
 
 
@@ -211,7 +212,8 @@ def test_wrong_steps_and_seeds_are_refused_in_a_line(task):
     refused("3 seeds are given for 2 environments", vector.reset, seed=[1, 2, 3])
     refused("leave reset_mask out", vector.reset, options={"reset_mask": np.ones(2, bool)})
     env.reset(seed=0)
-    vector.reset(seed=[1, 2])
+    vector.reset(seed=np.int64(1))
+    vector.reset(seed=np.array([1, 2]))
     refused(rf"shape \(1, {size + 1}\); .* takes shape \(1, {size}\)", env.step, np.zeros(size + 1))
     refused(rf"takes shape \(2, {size}\)", vector.step, np.zeros((3, size)))
     refused("NaN or infinite", env.step, np.full(size, np.nan))

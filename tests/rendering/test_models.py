@@ -5,6 +5,9 @@ from __future__ import annotations
 import copy
 import logging
 import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -13,9 +16,10 @@ import pytest
 from dmcvb_gen.distractors import DistractorSetting, load_backgrounds
 from dmcvb_gen.errors import DmcvbError, RenderingError
 from dmcvb_gen.generate import renderer_choice as choice
+from dmcvb_gen.generate.render import open_renderer
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.rendering import opengl, renderer_class
-from dmcvb_gen.tasks import LOCOMOTION_TASKS
+from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
 from tests.rendering.test_rendering import drawn_labels, frames_of, needs_opengl
@@ -235,13 +239,30 @@ def test_a_renderer_that_closes_takes_nothing_from_another():
     first, second = (renderer_class("opengl")(task, 32) for _ in range(2))
     before = second.render(physics, labels)
     first.render(physics, labels)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(RenderingError, match="make an environment in the thread that"):
+        pool.submit(first.render, physics, labels).result()
     del first
     np.testing.assert_array_equal(second.render(physics, labels), before)
 
 
 @needs_opengl
+def test_samples_are_those_that_opengl_gives():
+    with pytest.raises(RenderingError, match=r"OpenGL gives \d+ samples a pixel here, not 3; ask for --samples"):
+        renderer_class("opengl")(get_task("walker-walk"), 32, samples=3)
+
+
+@needs_opengl
+def test_an_environment_that_is_left_open_says_nothing_at_the_end():
+    code = "from dmcvb_gen.loaders.envs import DistractedEnv as E; e = E('walker-walk', renderer='opengl'); e.reset()"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0 and "Traceback" not in run.stderr
+
+
+@needs_opengl
 def test_a_video_needs_a_sky(tmp_path):
     task, physics = task_of(tmp_path, model(sky=""))
+    with pytest.raises(RenderingError, match="has no sky to show a video on; add a texture"):
+        open_renderer(task, DistractorSetting("dynamic"), "opengl", 64, None, "builtin", "train")
     with pytest.raises(RenderingError, match="has no sky to show a video on; add a texture"):
         labels = drawn_labels(task, DistractorSetting("dynamic"), physics[None])
         renderer_class("opengl")(task, 64, backgrounds=load_backgrounds()).render(physics, labels)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 
 import numpy as np
@@ -279,6 +280,25 @@ class LateChange(Arm):
 
 def other_models():
     return arm(xml=ARM.replace('<light pos="0 0 3"/>', '<light pos="0 0 3"/>' * np.random.randint(1, 100)))
+
+
+@functools.cache
+def one_environment():
+    return arm()
+
+
+@functools.cache
+def the_physics():
+    return mujoco.Physics.from_xml_string(ARM)
+
+
+def one_physics():
+    return control.Environment(the_physics(), Arm(), time_limit=0.5, control_timestep=0.02)
+
+
+def one_model():
+    physics = mujoco.Physics.from_model(the_physics().model)
+    return control.Environment(physics, DrawsItsModel(), time_limit=0.5, control_timestep=0.02)
 
 
 class PaintedAnew(Arm):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 import random
+import threading
 import time
 
 import mujoco
@@ -18,6 +20,8 @@ from dmcvb_gen.policies.simulate import replay, simulate
 from dmcvb_gen.seeding import episode_stream
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.environment import EnvironmentTask
+from dmcvb_gen.tasks.locomotion import WalkerWalk
+from dmcvb_gen.tasks.own import _of_class
 from tests.tasks import hostile_tasks as h
 from tests.tasks.hostile_tasks import having
 
@@ -84,6 +88,9 @@ REFUSED = {
     h.diverges_quietly: LATE + "the simulation diverged .mjWARN_BAD",
     h.quake: LATE + "changed hfield_data of the model in a step",
     h.LateChange: LATE + "changed geom_rgba of the model, and its first episodes did not",
+    h.one_environment: "gives environments that share their task, and episodes run side by side; make a new one",
+    h.one_physics: "gives environments that share their physics, and",
+    h.one_model: "gives environments that share their physics.model, and",
 }  # fmt: skip
 
 
@@ -193,6 +200,67 @@ def test_a_task_for_a_batch_is_refused_if_float32_does_not_hold_what_it_gives(mo
 def test_what_a_task_keeps_late_in_an_episode_does_not_reach_the_next_one():
     many, alone = rolled(task_of(h.CountsLate), range(3)), rolled(task_of(h.CountsLate), [2])
     np.testing.assert_array_equal(many.physics[2], alone.physics[0])
+
+
+def test_environments_in_threads_leave_every_generator_as_it_was():
+    task, done = task_of(h.plain), []
+
+    def play():
+        batch, rng = task.batch(2), np.random.default_rng(3)
+        batch.alone = False
+        for _ in range(20):
+            batch.reset([np.random.default_rng(place) for place in range(2)])
+            batch.step(rng.uniform(-1, 1, (2, 2)))
+            np.random.rand(3)
+        done.append(len({np.random.default_rng().integers(2**60) for _ in range(5)}))
+
+    threads = [threading.Thread(target=play) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert done == [5] * 4 and np.random.default_rng().integers(2**60) != np.random.default_rng().integers(2**60)
+
+
+@named([h.flat_torques, h.own_step_and_reset, h.plain])
+def test_a_batch_goes_on_from_stored_physics_whatever_the_environment_observes(case):
+    task, generators = task_of(case), [np.random.default_rng(0)]
+    batches = [task.batch(1) for _ in range(2)]
+    batches[0].reset(generators)
+    batches[0].step(np.ones((1, task.action_size)))
+    batches[1].set_physics(batches[0].physics())
+    after = [batch.step(np.ones((1, task.action_size))).state for batch in batches]
+    np.testing.assert_array_equal(*after)
+
+
+WRONG_CLASSES = {
+    "cameras = (7,)": "has views .'pixels',. and cameras .7,., and its model has [0-9]; name a camera of the model",
+    "cameras = ('nosuch',)": "cannot start task t .*nosuch",
+    "views = ('side', 'back')": "has views .'side', 'back'. and cameras .0,.",
+    "max_steps = 20.0": "has max_steps 20.0; give an int",
+    "batch = column": "gives reward of shape .2, 1. for two simulations; let it be .2,.",
+}
+
+
+def column(task, size, threads=1):
+    batch = WalkerWalk.batch(task, size)
+    step = batch.step
+
+    def stepped(actions):
+        found = step(actions)
+        return dataclasses.replace(found, reward=found.reward[:, None])
+
+    batch.step = stepped
+    return batch
+
+
+@pytest.mark.parametrize("wrong", WRONG_CLASSES)
+def test_a_class_of_ones_own_that_cannot_be_shown_or_stored_is_refused_in_one_line(wrong):
+    name, value = wrong.split(" = ")
+    kind = type("Own", (WalkerWalk,), {name: eval(value)})
+    with pytest.raises(DmcvbError, match=WRONG_CLASSES[wrong]) as caught:
+        _of_class("t", kind)
+    assert "\n" not in str(caught.value)
 
 
 def test_terrain_that_is_drawn_otherwise_than_it_was_stored_is_refused():
