@@ -78,8 +78,8 @@ def permissions() -> dict[str, str]:
 
 
 def allowed(variable: str) -> list[str]:
-    """The names in an environment variable; people write a space after a comma, or a comma at the end."""
-    return [name for part in os.environ.get(variable, "").split(",") if (name := part.strip())]
+    """The names in an environment variable, whatever commas and spaces people write between them."""
+    return os.environ.get(variable, "").replace(",", " ").split()
 
 
 def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
@@ -93,7 +93,8 @@ def find_function(name: str, variable: str, kind: str) -> Callable[..., Any]:
       DmcvbError: its code may not run, or cannot be found.
     """
     if name not in allowed(variable):
-        raise DmcvbError(f"{kind} {name} is code of your own; to let it run, set {variable}={name}")
+        names = ",".join([*allowed(variable), name])
+        raise DmcvbError(f"{kind} {name} is code of your own; to let it run, set {variable}={names}")
     refuse_file(kind, name)
     module, _, function = name.partition(":")
     if module == "__main__":

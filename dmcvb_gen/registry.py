@@ -15,7 +15,7 @@ from importlib import metadata
 from typing import Any, Generic, TypeVar
 
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
-from dmcvb_gen.own_code import import_plugins
+from dmcvb_gen.own_code import PLUGINS, import_plugins
 
 Thing = TypeVar("Thing")
 _log = logging.getLogger(__name__)
@@ -71,5 +71,6 @@ class Registry(Generic[Thing]):
           UnknownNameError: there is none; the message lists those that there are.
         """
         if name not in self.all():
-            raise UnknownNameError(self.kind, name, self.all())
+            own = f"one of your own needs {PLUGINS}=MODULE"
+            raise UnknownNameError(self.kind, name, self.all(), own)
         return self._things[name]

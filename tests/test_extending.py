@@ -38,7 +38,10 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path, monke
     assert len(np.unique(colors)) == 2  # one grey an episode
     assert (subset.read("exogenous/background_video") == -1).all()  # what it does not give is the task's own
     run("card", tmp_path / "r")
-    assert "Every material has the same grey" in (tmp_path / "r" / "README.md").read_text()
+    assert "a distractor of its author's own" in (tmp_path / "r" / "README.md").read_text()
+    monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", "")
+    run("card", tmp_path / "r", "--check")
+    run("view", tmp_path / "r", "--out", tmp_path / "page.html")
     for gone, told in (("", "unknown distractor 'grey'"), ("gone_file:Grey", "cannot find distractor gone_file:Grey")):
         monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", gone)
         output = invoke("verify", tmp_path / "r", code=3).output

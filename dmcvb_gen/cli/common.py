@@ -28,6 +28,13 @@ class GroupedCommand(click.Command):
         super().__init__(*arguments, **options)
         self.option_groups = option_groups or {}
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        *_, order = self.make_parser(ctx).parse_args(args=list(args))
+        single = [each for each in order if isinstance(each, click.Option) and not (each.multiple or each.is_flag)]
+        if twice := [each for number, each in enumerate(single) if each in single[:number]]:
+            raise click.UsageError(f"{twice[0].opts[0]} is given twice, and takes one value; give one of them", ctx)
+        return super().parse_args(ctx, args)
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         options = [parameter for parameter in self.get_params(ctx) if isinstance(parameter, click.Option)]
         records = {option.name: record for option in options if (record := option.get_help_record(ctx)) is not None}

@@ -29,10 +29,9 @@ def info(path, storage_options, as_json, progress):
     rows = []
     for subset in facts["subsets"]:
         planned = "" if subset["complete"] else f"/{subset['episodes_planned']:,}"
-        mark = " *" if subset["paper"] and subset["other_length"] else ""
         rows.append(
             (
-                subset["name"] + mark,
+                subset["name"],
                 f"{subset['episodes']:,}{planned}",
                 f"{subset['steps']:,}",
                 format_bytes(subset["bytes"]),
@@ -40,7 +39,7 @@ def info(path, storage_options, as_json, progress):
                 "" if subset["normalized"] is None else f"{subset['normalized']:.0f}",
             )
         )
-        if paper := subset["paper"]:
+        if (paper := subset["paper"]) and not subset["other_length"]:  # others earn other returns
             numbers = (f"{paper[key]:.1f}" for key in STATISTICS)
             rows.append(("  DMC-VB paper", "", f"{paper['steps']:,.0f}", "", *numbers, ""))
     title = f"{facts['name']} {facts['version']}"
@@ -63,8 +62,6 @@ def info(path, storage_options, as_json, progress):
     policies = dict.fromkeys(name for subset in facts["subsets"] for name in subset["policies"])
     if policies:
         click.echo(textwrap.fill(f"policies: {', '.join(policies)}", 80, break_on_hyphens=False))
-    if any(subset["paper"] and subset["other_length"] for subset in facts["subsets"]):
-        click.echo("* Episodes have another length than the paper's, so their returns cannot be compared.")
     if facts["subsets"] and not any(subset["images"] for subset in facts["subsets"]):
         paint = f"fetch {shown(path)} --paint --out FOLDER" if is_url(str(path)) else f"paint {quoted(unpinned(path))}"
         click.echo(f"No images are stored; add them: dmcvb-gen {paint}")
@@ -79,7 +76,8 @@ def info(path, storage_options, as_json, progress):
 def _look_of(subset) -> list[str]:
     """Lines on size, renderer and videos of a subset's images."""
     samples = f", {subset['samples']} samples a pixel" if subset["samples"] else ""
-    lines = [f"images: {subset['size']} x {subset['size']} pixels, {subset['renderer']}{samples}"]
+    sizes = ", ".join(f"{size} x {size}" for size in subset["sizes"] or [subset["size"]])
+    lines = [f"images: {sizes} pixels, {subset['renderer']}{samples}"]
     if videos := subset["videos"]:
         lines.append(f"videos: {videos['source']} ({videos['split']})")
     return lines

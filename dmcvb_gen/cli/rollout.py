@@ -87,7 +87,8 @@ def begin(as_json, progress, other_versions, **options):
     plan = _plan(options | {"only": (), "episode_range": None})
     start(plan, other_versions, command="cluster begin")
     place = quoted(plan.store.place)
-    begun = f"begun, {pluralize(len(plan.works), 'shards')} to make: dmcvb-gen cluster part {place} 1/N to N/N"
+    same = " (with the same --option)" if options["storage_options"] else ""
+    begun = f"begun, {pluralize(len(plan.works), 'shards')} to make: dmcvb-gen cluster part {place} 1/N to N/N{same}"
     answer(as_json, {"out": plan.store.place, "shards": len(plan.works)}, f"{plan.store.place}: {begun}")
 
 
@@ -102,7 +103,8 @@ def part(release, part, as_json, workers, other_versions, only, episode_range, s
     store = open_store(release, storage_options)
     plan = make_plan(None, store, only or (), episode_range, parse_part("PART", part))
     start(plan, other_versions, "cluster part")
-    _run(plan, workers, as_json, whole=False)
+    same = " (with the same --option)" if storage_options else ""
+    _run(plan, workers, as_json, then=f"`dmcvb-gen cluster finish {quoted(store.place)}`{same}")
 
 
 @command_of(making.rollout, only=("storage_options",))
@@ -112,7 +114,6 @@ def finish(release, storage_options, as_json, progress):
     from dmcvb_gen.dataset.gate import Release
     from dmcvb_gen.dataset.writer import finish as write
     from dmcvb_gen.errors import StoreError
-    from dmcvb_gen.generate.works import missing_subsets
     from dmcvb_gen.storage.store import open_store
 
     store = open_store(release, storage_options)
@@ -120,7 +121,7 @@ def finish(release, storage_options, as_json, progress):
     if Release.read_copy(store) is not None:
         raise StoreError(f"{store.place} is a copy of a release, which was finished where it was made")
     done = write(store)
-    missing = missing_subsets(done)
+    missing = list(done.unfinished)
     state = "complete"
     if missing:
         state = f"not complete; shards are missing in {pluralize(len(missing), 'subsets')}, e.g. {missing[0]}"
@@ -149,25 +150,25 @@ def _plan(options):
     return plan
 
 
-def _run(plan, workers, as_json, whole=True):
+def _run(plan, workers, as_json, then=None):
+    """Run a plan and tell its result; `then`: the command that finishes a release of which this is a part."""
     from dmcvb_gen.generate.plan import run_plan
-    from dmcvb_gen.generate.works import missing_subsets
 
     with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
         started = time.monotonic()
-        release, steps = run_plan(plan, workers, bar, finishing=whole)
+        release, steps = run_plan(plan, workers, bar, finishing=not then)
     seconds, place = time.monotonic() - started, plan.store.place
-    complete = whole and not missing_subsets(release)
+    complete = not then and not release.unfinished
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(seconds, 2))
     named = quoted(place)
     state = "complete" if complete else f"not complete yet (dmcvb-gen rollout --out {named} --dry-run shows the rest)"
-    if not whole:
-        state = f"finished with `dmcvb-gen cluster finish {named}` when all parts are done"
+    if then:
+        state = f"finished with {then} when all parts are done"
     rate = f" at {steps / seconds:,.0f} steps/s" if steps else ""
     done = f"{place}: {steps:,} steps in {seconds:.0f} s{rate}; the release is {state}."
     images = not is_url(str(place)) and any(layer.kind == "images" for layer in release.layers.values())
     look = f"Look at it: dmcvb-gen info {named}" + (f"; dmcvb-gen preview {named}" if images else "")
-    answer(as_json, facts, done, *([look] if whole else []))
+    answer(as_json, facts, done, *([] if then else [look]))
 
 
 def _show_plan(plan, as_json):

@@ -361,20 +361,34 @@ class Release:
     @property
     def shortfalls(self) -> dict[str, tuple[int, int]]:
         """Subsets that are not whole here -> (episodes here, episodes that belong to them)."""
-        return self._fewer_than(self.manifest.subsets)
+        here = {name: len(subset.episodes) for name, subset in self.subsets.items()}
+        pairs = {record.name: (here.get(record.name, 0), record.episodes) for record in self.manifest.subsets}
+        return {name: (count, planned) for name, (count, planned) in pairs.items() if count < planned}
 
     @property
     def unfinished(self) -> dict[str, tuple[int, int]]:
-        """The same of what recipes ask for, in the folder where the release is made."""
-        if not self.store.folder or self.copy or self.manifest_path != MANIFEST:
+        """The same of what recipes ask for, with their images, where the release is made."""
+        if self.copy or self.manifest_path != MANIFEST:
             return self.shortfalls
-        return self._fewer_than(record for recipe in read_recipes(self.store) for record in recipe.subsets)
+        try:
+            digests = _recipes_at(self.store)
+        except StoreError:  # a server that lists nothing
+            return self.shortfalls
+        recipes = [read_recipe(self.store, digest) for digest in digests]
+        asked = merged_subsets(record for recipe in recipes for record in recipe.subsets)
+        named = {record.name: record.episodes for record in self.manifest.subsets}
+        here = {
+            name: min(named.get(name, 0), *map(self._listed_episodes, record.layers)) for name, record in asked.items()
+        }
+        return {name: (here[name], asked[name].episodes) for name in asked if here[name] < asked[name].episodes}
 
-    def _fewer_than(self, asked: Iterable[SubsetRecord]) -> dict[str, tuple[int, int]]:
-        here = {name: len(subset.episodes) for name, subset in self.subsets.items()}
-        asked = sorted(asked, key=lambda record: record.episodes)  # the largest count of a subset comes last
-        pairs = {record.name: (here.get(record.name, 0), record.episodes) for record in asked}
-        return {name: (count, planned) for name, (count, planned) in pairs.items() if count < planned}
+    def _listed_episodes(self, name: str) -> int:
+        """Episodes of a layer that the manifest names; of a release in the making, those that are here."""
+        layer = self.layers.get(name)
+        if layer is None:
+            return 0
+        shards = layer.shards if isinstance(layer, ListedLayer) else len(self.here(name)) * self.in_the_making
+        return shards * layer.episodes_per_shard
 
     @property
     def path(self) -> Path:

@@ -27,7 +27,7 @@ from typing_extensions import TypedDict
 
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.files import parse_json, sha256_bytes
-from dmcvb_gen.spec import LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec, parse_setting
+from dmcvb_gen.spec import LOCOMOTION, DistractorSetting, GoalMode, SubsetSpec, is_maze, parse_setting
 
 MANIFEST, COPY = "manifest.json", "copy.json"
 RECIPES, RECORDS, LAYERS, MANIFESTS, PROVENANCE = "recipes/", "records/", "layers/", "manifests/", "provenance/"
@@ -321,7 +321,7 @@ class SubsetRecord(_Model):
     @property
     def goal_mode(self) -> GoalMode | None:
         """Treatment of a maze's goal; None for tasks without one."""
-        return parse_setting(self.task, self.setting)[1]
+        return parse_setting(self.task, self.setting)[1] if is_maze(self.task) else None
 
     @property
     def imported(self) -> bool:
@@ -588,6 +588,11 @@ def _difference(one: Layer, other: Layer) -> str:
     pairs["arrays"] = (_arrays(one, other), _arrays(other, one))
     differing = [(name, *pair) for name, pair in pairs.items() if pair[0] != pair[1]]
     field, first, second = differing[0] if differing else ("arrays", "one form", "another form of the same arrays")
+    if field == "rows":
+        had, asked = one.rows - 1, other.rows - 1
+        return f"{one.name} has --max-steps {had}, asked for {asked}; give it too, or choose another --out"
+    if field == "code":
+        return f"the code of {one.name}'s task has changed since; choose another --out"
     images = field == "arrays" and other.kind == "images"
     paint = f"add these images with `paint --size {other.arrays[0].shape[0]}`, or " if images else ""
     return f"{one.name} has {field} {shortened(first)}, asked for {shortened(second)}; {paint}choose another --out"

@@ -231,7 +231,8 @@ class Subset:
 
     def _without_images(self, layer: Layer | None = None) -> str:
         size = layer.arrays[0].shape[0] if layer else self.record.size
-        option = f" --size {size}" if size != self.record.size else ""
+        known = next(record for record in self.release.manifest.subsets if record.name == self.name)
+        option = f" --size {size}" if size != known.size else ""
         python = "" if option else " (in Python, dmcvb_gen.open(..., paint=True) renders them as they are read)"
         command = f"dmcvb-gen paint {quoted(self.release.place)}{option}"
         return f"{self.name} has episodes without images; add them: `{command}`{python}"

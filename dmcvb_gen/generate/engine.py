@@ -98,7 +98,7 @@ class ShardOutcome:
         if self.equal is None:
             return text + "made"
         if self.equal:
-            return text + ("repaired" if self.repaired else "same digest")
+            return text + ("repaired" if self.repaired else "regenerated with the same digest")
         text += "MISMATCH: digest differs"
         for difference in self.differences:
             if difference.largest is None:

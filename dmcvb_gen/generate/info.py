@@ -54,6 +54,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
                 steps=subset.steps,
                 bytes=subset.bytes,
                 size=subset.record.size,
+                sizes=sorted({layer.arrays[0].shape[0] for layer in subset.layers if layer.kind == "images"}),
                 images=any(layer.kind == "images" for layer in subset.layers),
                 renderer=subset.record.renderer.get("name"),
                 samples=subset.record.renderer.get("samples"),

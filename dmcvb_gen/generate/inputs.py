@@ -107,7 +107,7 @@ def shown_videos(subset: Subset, moved: str | None = None) -> str:
       moved: folder of the videos, instead of the manifest's.
     """
     release, record = subset.release, whose_videos(subset.release, subset.record)
-    if subset.record.distractor.kind != "none":
+    if subset.setting != "none":
         moved = moved or subset.other_videos
     if moved or (record.backgrounds or {}).get("source", BUILTIN) == BUILTIN:
         return moved or BUILTIN

@@ -62,10 +62,10 @@ def _bundled(record: SubsetRecord) -> float | None:
     from dmcvb_gen.policies.policy_file import read_header
     from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 
-    whole = get_task(record.task).at(record.action_repeat).max_steps
-    if record.action_repeat > ACTION_REPEAT or record.max_steps != whole:
-        return None
     try:
+        whole = get_task(record.task).at(record.action_repeat).max_steps
+        if record.action_repeat > ACTION_REPEAT or record.max_steps != whole:
+            return None
         header = read_header(bundled_policies(record.task, "expert")[0])
     except DmcvbError:
         return None

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import FileRecord, Layer, ListedLayer, Manifest, Resolved, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset.manifest import FileRecord, Layer, Manifest, Resolved, ShardRecord, SubsetRecord
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.store import Store
 
@@ -190,14 +190,3 @@ def episodes_left(works: Sequence[Work]) -> Counter[str]:
                 last = min(work.episodes.stop, setting.record.episodes)
                 left[setting.record.name] += last - work.episodes.start
     return left
-
-
-def missing_subsets(release: Release) -> list[str]:
-    """Subsets that recipes ask for, and that a release does not have, or not whole."""
-    asked = Release.in_making(release.store).manifest.subsets
-    there = {layer.name: layer for layer in release.manifest.layers if isinstance(layer, ListedLayer)}
-
-    def whole(name: str, episodes: int) -> bool:
-        return name in there and there[name].shards >= there[name].shards_for(episodes)
-
-    return [record.name for record in asked if not all(whole(name, record.episodes) for name in record.layers)]

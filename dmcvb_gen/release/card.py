@@ -21,7 +21,6 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import CARD_FOLDER, MANIFEST, Manifest, Resolved
 from dmcvb_gen.dataset.writer import read_provenance
 from dmcvb_gen.distractors import load_backgrounds
-from dmcvb_gen.distractors.registry import distractors_of
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.info import STATISTICS, describe_release
 from dmcvb_gen.generate.inputs import video_source
@@ -172,7 +171,7 @@ def _summary(release: Release, facts: dict[str, Any]) -> str:
         held = "states, full physics states and the labels of every visual distractor, from which `dmcvb-gen paint` "
         held += "makes the pictures"
     text = (
-        f"{manifest.description} Offline-RL episodes of {tasks} with {held}: "
+        f"{manifest.description}\n\nOffline-RL episodes of {tasks} with {held}: "
         f"{pluralize(len(facts['subsets']), 'subsets')}, "
         f"{pluralize(sum(subset['episodes'] for subset in facts['subsets']), 'episodes')}, {facts['steps']:,} steps."
     )
@@ -249,20 +248,17 @@ def _arrays(release: Release) -> dict[tuple, list[str]]:
 
 def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, str]]:
     """Rows (setting, what varies and how much) of the table of distractors; none for mazes alone."""
-    settings: dict[str, DistractorSetting] = {}
-    for record in manifest.subsets:
-        if record.goal_mode is None:
-            settings.setdefault(record.setting, record.distractor)
-    return [(name, _varied(setting)) for name, setting in settings.items()]
+    settings = dict.fromkeys(record.setting for record in manifest.subsets if record.goal_mode is None)
+    return [(name, _varied(name)) for name in settings]
 
 
-def _varied(setting: DistractorSetting) -> str:
+def _varied(name: str) -> str:
     """The parts of a distractor that vary, with their scales, in words."""
-    if setting.kind == "none":
+    if name == "none":
         return "the model's own camera, colors and sky"
-    if setting.kind not in DISTRACTOR_KINDS:
-        found = [d for d in distractors_of(setting) if d.kinds]
-        return f"s = {setting.scale:g}; " + "; ".join((d.__doc__ or d.__name__).splitlines()[0] for d in found)
+    if name.partition("_")[0] not in DISTRACTOR_KINDS:
+        return "a distractor of its author's own"
+    setting = DistractorSetting.parse(name)
     videos = "all videos" if setting.videos is None else f"up to {setting.videos} videos"
     words = {"background": videos, CUE: f"correlation {setting.scale_of(CUE):g}"}
     varied = [part for part in ALL_PARTS if setting.varies(part)]
@@ -332,7 +328,8 @@ def _lacking_videos(release: Release) -> list[str]:
     """A sentence for each number of background videos that a setting names and that is more than there are."""
     found: dict[str, None] = {}
     for record in release.manifest.subsets:
-        if not record.backgrounds or not record.distractor.videos:
+        own = record.setting.partition("_")[0] not in DISTRACTOR_KINDS  # whose code may not be here
+        if not record.backgrounds or own or not record.distractor.videos:
             continue
         with contextlib.suppress(BackgroundError):  # a folder of videos that is elsewhere now
             there = len(load_backgrounds(video_source(release.place, record), record.split))

@@ -6,6 +6,7 @@ sample of frames painted again.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -18,8 +19,9 @@ from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.generate.inputs import local_inputs, video_source
 from dmcvb_gen.generate.modalities import modality_of, stored_in
 from dmcvb_gen.generate.render import modality_of_frames, renderer_for
+from dmcvb_gen.own_code import PLUGINS
 from dmcvb_gen.policies.simulate import replay
-from dmcvb_gen.release.issue import Issue
+from dmcvb_gen.release.issue import UNCHECKED, Issue
 from dmcvb_gen.rendering.base import Renderer
 from dmcvb_gen.tasks import get_task
 
@@ -51,6 +53,11 @@ def check_contents(subset: Subset, backgrounds: str | None = None) -> Iterator[I
     yield from check_replays(subset) if get_task(subset.task).replayed else check_physics(subset)
     if subset.pixel_arrays:
         yield from check_pixels(subset, backgrounds)
+    images = [spec.name for layer in subset.layers if layer.kind == "images" for spec in layer.arrays]
+    for name in {*images} - {*stored_in(images)}:
+        if picture_of(name) is None and not re.match(r"at\d+/", name):
+            message = f"{name} is of a modality that is not known here; set {PLUGINS} to the module that registers it"
+            yield Issue(UNCHECKED, subset.name, message)
 
 
 def _sample(count: int, wanted: int) -> np.ndarray:

@@ -69,7 +69,8 @@ def _publish_release(
     _check_complete(release, root, pixels)
     check_apart(release, store, "choose another URL")
     if not release.copy and (lacking := release.unfinished):
-        _log.warning("%s lacks a part of %s, which stays unpublished", root, min(lacking))
+        few = ", ".join(sorted(lacking)[:3]) + ", ..." * (len(lacking) > 3)
+        _log.warning("%s is not finished: %s lack episodes or images, which stay unpublished", root, few)
     if (card := release.store.find(README, MANIFEST_BYTES)) and str(release.digest).encode() not in card:
         _log.warning("%s/%s is no card of this version; `dmcvb-gen card %s` writes one", root, README, root)
     text, texts = release.text, dict(attachments(release.store))

@@ -157,9 +157,7 @@ def verify_folder(
     for found in in_order(_check_subset, [(subset, backgrounds) for subset in chosen], workers, tick):
         findings += found
     result = _verification(release, chosen, findings, (files, files), sound)
-    if names is None and result.sound:
-        result = replace(result, incomplete=result.incomplete | release.unfinished)
-    return result
+    return replace(result, incomplete=release.unfinished | result.incomplete) if names is None else result
 
 
 def _verify_bytes(release: Release, everything: bool, tick: ProgressCallback, workers: int) -> Verification:
@@ -273,7 +271,9 @@ def _strange(release: Release, files: Sequence[Listed]) -> Iterator[Issue]:
     unplanned = not any(path.endswith(ZARR_JSON) for path in known)  # as something else is damaged
     making = dict(release.layers)
     try:
-        making |= merged_layers(read_recipes(release.store))  # those that the manifest does not name, too
+        recipes = read_recipes(release.store)
+        making |= merged_layers(recipes)  # those that the manifest does not name, too
+        known |= {file.path for recipe in recipes for file in recipe.inputs}
     except StoreError as error:
         yield Issue("files", RECIPES, str(error))
     arrays = tuple(f"{layer.group}/{spec.stored_name}/c/" for layer in making.values() for spec in layer.arrays)
@@ -303,11 +303,14 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
     tick(subset.name)
     try:
         from dmcvb_gen.distractors.registry import distractors_of
+        from dmcvb_gen.generate.resolve import code_of_task
         from dmcvb_gen.release import contents
         from dmcvb_gen.tasks import get_task
 
         get_task(subset.task)
         distractors_of(subset.record.distractor)
+        if subset.trajectories.makes.get("code", "") != code_of_task(subset.task):
+            raise DmcvbError(f"the code of {subset.task} is not that which made these data")
     except ModuleNotFoundError as error:
         # Fetch-only installs have no simulator; bytes are checked all the same, and this says what was not.
         lacks = f"values, physics and images were not checked: {error.name} is not installed"

@@ -159,7 +159,7 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
     """Collect what the page shows of an episode: facts, views with their raw frames, and groups of curves."""
     pictures, layer = shown(subset), subset.trajectories
     span = layer.episodes_of(index // layer.episodes_per_shard)
-    shows = subset.record.goal_mode or subset.record.distractor.kind != "none"
+    shows = subset.setting != "none"
     labels = [name for name in DISTRACTOR_STATE_NAMES if shows and f"exogenous/{name}" in subset.arrays]
     numbers = ["state", "action", "reward", "seed", "terminated"]
     values = subset.episode(index, [*numbers, *(f"exogenous/{name}" for name in labels), *pictures.arrays])

@@ -61,6 +61,8 @@ def storage_errors(place: str | Path, doing: str = "read", decoding: bool = Fals
             raise
         kind = Refused if isinstance(error, PermissionError) else StoreError
         client = package in CLIENTS or isinstance(error.__cause__, OSError)
+        if isinstance(error, TypeError) and "unexpected keyword argument" in str(error) and is_url(str(place)):
+            raise StoreError(f"{reason(error)}: the file system of {shown(str(place))} has no such --option") from None
         raise kind(_explained(error, str(place), doing, client)) from None
 
 
@@ -83,13 +85,16 @@ def _explained(error: Exception, place: str, doing: str, client: bool) -> str:
         if client:
             return _not_reached(error, where, doing)
         return f"{where} is damaged ({why.split('. ')[0]}); repair it with `dmcvb-gen regenerate`, or fetch it again"
-    if not url and isinstance(error.filename, str) and os.path.isabs(error.filename):
-        where = error.filename  # the file that failed, e.g. of a scratch folder
+    failed = error.filename2 or error.filename  # of a renaming the new name, else e.g. a file of a scratch folder
+    if not url and isinstance(failed, str) and os.path.isabs(failed):
+        where = failed
     if error.errno in NO_ROOM:
         return f"no room to {doing} {where} ({error.strerror}); make room and rerun the same command"
     if not url and (file := next((str(path) for path in Path(where).parents if path.is_file()), None)):
         return f"cannot {doing} {where}: {file} is a file; choose another place"
-    if isinstance(error, FileNotFoundError | NotADirectoryError | IsADirectoryError):
+    if isinstance(error, IsADirectoryError):
+        return f"cannot {doing} {where}: it is a folder; name a file"
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
         there = "create the bucket first" if url else "create the folder first, or choose another place"
         cure = "check the path, or fetch or regenerate it" if doing == "read" else there
         return f"cannot {doing} {where}: it is not there ({why}); {cure}"

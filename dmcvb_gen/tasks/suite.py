@@ -6,6 +6,7 @@ import copy
 import functools
 import importlib
 import importlib.util
+import logging
 import re
 import warnings
 from pathlib import Path
@@ -32,9 +33,12 @@ def suite_ids() -> tuple[str, ...]:
 
 
 def import_quietly(module: str) -> Any:
-    """A module of dm_control; the first import warns of a display that is not used."""
+    """A module of dm_control; the first import warns of a display that is not used, and sets up logging."""
+    handlers = list(logging.root.handlers)
     with warnings.catch_warnings(action="ignore"):
-        return importlib.import_module(f"dm_control.{module}")
+        found = importlib.import_module(f"dm_control.{module}")
+    logging.root.handlers[:] = handlers
+    return found
 
 
 def suite_task(task_id: str) -> EnvironmentTask:

@@ -59,8 +59,10 @@ def test_images_that_were_asked_for_are_missing_until_they_are_there(tmp_path):
     words = ["walker-walk", "--level", "random", "--episodes", 2, "--episodes-per-shard", 1, "--max-steps", 3]
     words += ["--size", 16, "--out", tmp_path / "r"]
     run("rollout", *words, "--no-pixels")
+    assert told("verify", tmp_path / "r")["complete"]
     assert not told("rollout", *words, "--range", "0:1")["complete"]
     assert "shards are missing in 1 subset" in invoke("cluster", "finish", tmp_path / "r", code=1).output
+    assert invoke("verify", tmp_path / "r", code=3) and not told("info", tmp_path / "r")["complete"]
 
 
 def test_two_who_make_the_same_shards_end_in_one_release(whole, tmp_path):

@@ -89,7 +89,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
     from dmcvb_gen.loaders.matching import environment_options
 
     record = source.subset.record
-    setting = record.setting if record.goal_mode else record.distractor.kind
+    setting = record.setting.partition("_")[0]
     options = environment_options(source.subset, split)
     name = environment_id(record.name.split("/")[0], setting)
     registered = gymnasium.registry.get(name)

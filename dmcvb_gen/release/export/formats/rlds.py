@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.release.dmcvb_names import picture_feature, state_feature
 from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
 from dmcvb_gen.release.export.registry import register_exporter
@@ -78,9 +79,12 @@ def _tensor(dtype: str, *shape: int) -> dict[str, Any]:
     }
 
 
-def _features(source: Source) -> dict[str, Any]:
-    from dmcvb_gen.tasks import get_task
+def _fields(subset: Subset) -> dict[str, tuple[int, int]]:
+    """Name -> first place and last + 1 of each field of a state."""
+    return subset.spec("state").attributes["fields"]
 
+
+def _features(source: Source) -> dict[str, Any]:
     subset = source.subset
     size = str(subset.record.size)
     picture = {
@@ -89,8 +93,8 @@ def _features(source: Source) -> dict[str, Any]:
     }
     observation = {_picture_name(source, view): picture for view in source.views}
     observation["state"] = _tensor("float32", subset.array("state").shape[-1])
-    for name, part in get_task(subset.task).state_slices.items():
-        shape = [part.stop - part.start] if part.stop - part.start > 1 else []
+    for name, (first, last) in _fields(subset).items():
+        shape = [last - first] if last - first > 1 else []
         observation[state_feature(subset.task, name)] = _tensor("float64", *shape)
     step = {
         "observation": _dict(observation),
@@ -114,8 +118,6 @@ def _picture_name(source: Source, view: str) -> str:
 
 
 def _example(source: Source, episode: ExportEpisode) -> dict[str, np.ndarray | list[bytes]]:
-    from dmcvb_gen.tasks import get_task
-
     task = source.subset.task
     rows = episode.length + 1
     step = np.arange(rows)
@@ -127,8 +129,8 @@ def _example(source: Source, episode: ExportEpisode) -> dict[str, np.ndarray | l
         f"steps/observation/{_picture_name(source, view)}": [png(frame) for frame in frames]
         for view, frames in episode.pixels.items()
     }
-    for name, part in get_task(task).state_slices.items():
-        values[f"steps/observation/{state_feature(task, name)}"] = episode.state[:, part]
+    for name, (first, last) in _fields(source.subset).items():
+        values[f"steps/observation/{state_feature(task, name)}"] = episode.state[:, first:last]
     if source.subset.record.fixed_goals:
         values["goal_pair"] = source.subset.read("goal_pair", [episode.index])
     return values | {
