@@ -80,8 +80,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         given = signature.bind(*args, **kwargs)
         for name, value in given.arguments.items():
             given.arguments[name] = _checked(name, value, signature.parameters[name].annotation)
-        with naming_parameters():
-            return function(*given.args, **given.kwargs)
+        return naming_parameters()(function)(*given.args, **given.kwargs)
 
     return call
 

@@ -186,6 +186,6 @@ def _show_plan(plan, as_json):
     )
     click.echo(f"release: {plan.store.place}")
     click.echo(
-        f"{pluralize(len(plan.works), 'shards')} to make; {left:,} episodes, {frames:,} images, at most "
+        f"{pluralize(len(plan.works), 'shards')} to make; {pluralize(left, 'episodes')}, {frames:,} images, at most "
         f"{format_bytes(raw)} before compression"
     )

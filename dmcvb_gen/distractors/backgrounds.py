@@ -49,8 +49,6 @@ class Backgrounds:
     Making one decodes every video once, so that a bad file is found before any work; a pickled one opens at once.
 
     Attributes:
-      source: "builtin" or the folder.
-      split: "train" or "val".
       names: names of the videos, in order.
       files: files of each video, in order: one, or a picture a frame.
       lengths: frames of each video.
@@ -60,8 +58,7 @@ class Backgrounds:
       BackgroundError: a file cannot be read.
     """
 
-    def __init__(self, source: str, split: str, videos: list[tuple[str, tuple[Path, ...]]]):
-        self.source, self.split = source, split
+    def __init__(self, videos: list[tuple[str, tuple[Path, ...]]]):
         self.names = tuple(name for name, _ in videos)
         self.files = tuple(files for _, files in videos)
         self._decoded: OrderedDict[int, np.ndarray] = OrderedDict()
@@ -122,7 +119,7 @@ def load_backgrounds(source: str | Path = "builtin", split: str = "train") -> Ba
 @functools.lru_cache(maxsize=2)
 def _open(source: str, split: str, videos: tuple, stamps: tuple) -> Backgrounds:
     """Plans, workers and verification open the same source again and again; `stamps` notices changed files."""
-    return Backgrounds(source, split, list(videos))
+    return Backgrounds(list(videos))
 
 
 def _find_split(root: Path, split: str) -> list[tuple[str, tuple[Path, ...]]]:

@@ -134,6 +134,7 @@ def _scene(task: str, distractor: str, options: Mapping[str, Any]) -> Scene:
 class _Stage:
     """`count` episodes with their distractors and pictures; restarted one by one."""
 
+    @naming_parameters()
     def __init__(self, count: int, scene: Scene):
         if count < 1:
             raise DmcvbError(f"num_envs is {count}; give at least 1")
@@ -295,8 +296,7 @@ class DistractedEnv(gymnasium.Env):
     def __init__(self, task: str, distractor: str = "none", *, render_mode: str | None = None, **options: Any):
         if render_mode not in (None, "rgb_array"):
             raise DmcvbError(f"render_mode {render_mode!r} is not offered; give 'rgb_array' or None")
-        with naming_parameters():
-            self._stage = _Stage(1, _scene(task, distractor, options))
+        self._stage = _Stage(1, _scene(task, distractor, options))
         self.task, self.render_mode = self._stage.task, render_mode
         self.observation_space, self.action_space = self._stage.spaces()
         self.metadata = self.metadata | {"render_fps": round(1 / self.task.seconds_per_step)}
@@ -350,8 +350,7 @@ class DistractedVectorEnv(VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": [], "render_fps": 20}
 
     def __init__(self, num_envs: int, task: str, distractor: str = "none", **options: Any):
-        with naming_parameters():
-            self._stage = _Stage(num_envs, _scene(task, distractor, options))
+        self._stage = _Stage(num_envs, _scene(task, distractor, options))
         self.num_envs, self.task, self.render_mode = num_envs, self._stage.task, None
         self.single_observation_space, self.single_action_space = self._stage.spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)

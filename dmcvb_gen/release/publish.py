@@ -27,7 +27,7 @@ from dmcvb_gen.parallel import ProgressCallback, expect
 from dmcvb_gen.release.fetch import Moved
 from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at
 from dmcvb_gen.storage.store import Store, open_store
-from dmcvb_gen.text import quoted
+from dmcvb_gen.text import pluralize, quoted
 
 _log = logging.getLogger("dmcvb_gen")
 README = ATTACHMENT_FILES[0]
@@ -69,8 +69,8 @@ def _publish_release(
     _check_complete(release, root, pixels)
     check_apart(release, store, "choose another URL")
     if not release.copy and (lacking := release.unfinished):
-        few = ", ".join(sorted(lacking)[:3]) + ", ..." * (len(lacking) > 3)
-        _log.warning("%s is not finished: %s lack episodes or images, which stay unpublished", root, few)
+        some = pluralize(len(lacking), "subsets")
+        _log.warning("%s is not finished: episodes or images of %s stay unpublished, e.g. %s", root, some, min(lacking))
     if (card := release.store.find(README, MANIFEST_BYTES)) and str(release.digest).encode() not in card:
         _log.warning("%s/%s is no card of this version; `dmcvb-gen card %s` writes one", root, README, root)
     text, texts = release.text, dict(attachments(release.store))

@@ -134,9 +134,7 @@ class EnvironmentTask(Task):
         episode.reset(seed)
         if episode.terrain != key:
             raise self.error("draws other terrain than is stored; install dm_control, numpy and scipy as they were")
-        heights = episode.model.hfield_data.copy()
-        episode.close()
-        return heights
+        return episode.model.hfield_data.copy()
 
     def at(self, action_repeat: int) -> Task:
         other = super().at(action_repeat)
@@ -402,11 +400,6 @@ class _Episode:
             if self.task.trusted:
                 self._observe(None)
 
-    def close(self) -> None:
-        """Let go of what the environment holds."""
-        with self._told():
-            self.environment.close()
-
     def error(self, reason: str) -> EpisodeError:
         return EpisodeError(self.task.id, self.place, self.steps, reason)
 
@@ -489,7 +482,7 @@ class EnvironmentBatch(EpisodeBatch):
     def _begin(self, sim: int, seed: int) -> _Episode:
         """A new episode in a place, in an environment of its own."""
         if before := self._episodes[sim]:
-            before.close()
+            before.environment.close()
         episode = self._episodes[sim] = _Episode(self.task, self.task.make_environment(seed), sim)
         episode.reset(seed)
         return episode

@@ -81,7 +81,10 @@ OTHERS = [
     ("info r --option a=1 --option b=2 --json --json", "--option has no effect"),
     ("view r --out empty", "empty: it is a folder; name a file"),
     ("repaint r --size 16 --size 32 --out new", "--size is given twice, and takes one value"),
-    ("rollout walker-walk --level random --max-steps 9 --seed 3 --out r", "has --max-steps 500, asked for 9; give it too, or"),
+    (
+        "rollout walker-walk --level random --max-steps 9 --seed 3 --out r",
+        "has --max-steps 500, asked for 9; give it too, or",
+    ),
     ("info s3://bucket/r --option nope=1", "keyword argument 'nope': the file system of s3://bucket"),
     ("info s3://", "s3:// names no bucket; give s3://BUCKET/NAME"),
     ("info a b", "see `dmcvb-gen info --help`"),
