@@ -15,7 +15,9 @@ import pytest
 
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.modalities import all_modalities
 from dmcvb_gen.registry import Registry
+from dmcvb_gen.release.verify import verify
 from tests.conftest import MAIN, invoke, python, run
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples" / "extending"
@@ -50,7 +52,7 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path, monke
 
 @pytest.mark.slow_cases("small_mazes", "small_release")
 @pytest.mark.parametrize("family", ["small_release", "small_mazes"])
-def test_a_modality_of_your_own_is_stored_exported_and_observed(family, request, tmp_path):
+def test_a_modality_of_your_own_is_stored_exported_and_observed(family, request, tmp_path, monkeypatch):
     load("modality")
     run("repaint", request.getfixturevalue(family), "--only", "*/random/*", "--label", "near", "--out", tmp_path / "r")
     run("verify", tmp_path / "r")
@@ -58,6 +60,9 @@ def test_a_modality_of_your_own_is_stored_exported_and_observed(family, request,
     name = next(array for array in subset.arrays if array.split("/")[0] == "near")
     near = subset.episode(0, [name])[name]
     assert near.dtype == np.uint8 and set(np.unique(near)) <= {0, 1}
+    with monkeypatch.context() as context:
+        context.delitem(all_modalities(), "near")
+        assert "near" in str(verify(tmp_path / "r").unchecked[0])
     run("export", tmp_path / "r", "--to", "lerobot", "--out", tmp_path / "x")
     assert any("observation.images.near" in path.read_text() for path in (tmp_path / "x").rglob("info.json"))
     name = "walker-walk-none" if family == "small_release" else "ant-maze-empty7x7-visible"

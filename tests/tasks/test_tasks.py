@@ -19,7 +19,7 @@ from dmcvb_gen.release.verify import verify
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, PHYSICS_SPEC, get_task, suite_ids
 from dmcvb_gen.tasks.base import tolerance
 from tests.conftest import invoke, rewrite, roll_out, small_recipe
-from tests.tasks.hostile_tasks import ARM
+from tests.tasks.hostile_tasks import ARM, EndedByPython, arm
 from tests.tasks.test_own_tasks import check_episode, rolled
 
 TOLERANCE = {"walker-walk": 0.0, "cheetah-run": 0.0, "humanoid-walk": 1e-15}
@@ -151,7 +151,7 @@ def test_the_code_of_a_task_of_ones_own_runs_only_if_a_person_named_it(tmp_path,
     allow(["arm_tasks:missing"])
     with pytest.raises(DmcvbError, match="cannot find task arm_tasks:missing"):
         get_task("arm_tasks:missing")
-    monkeypatch.setenv(ALLOWED, "other:task, arm_tasks:from_file ,")  # as people write lists
+    monkeypatch.setenv(ALLOWED, "other:task, a:b arm_tasks:from_file ,")  # as people write lists
     task = get_task("arm_tasks:from_file")
     starts = task.batch(2).reset([np.random.default_rng(seed) for seed in range(2)])
     assert task.max_steps == 5 and (starts[0] != starts[1]).any()
@@ -169,11 +169,17 @@ def test_a_release_of_ones_own_task_is_verified_by_replay_and_not_checked_withou
     found = verify(tmp_path / "wrong").findings
     assert ("rewards", 1, 3) in {(issue.check, issue.episode, issue.step) for issue in found}
 
+    monkeypatch.setattr("arm_tasks.ends", lambda: arm(EndedByPython(), ARM.replace('size=".05"', 'size=".06"')))
+    get_task.cache_clear()
+    assert "the code of arm_tasks:ends is not that which made these data" in str(verify(tmp_path / "r").unchecked[0])
+
     monkeypatch.delenv(ALLOWED)
     get_task.cache_clear()
     found = verify(tmp_path / "r")
     assert found.sound and not found.complete and "set DMCVB_GEN_TASKS=arm_tasks:ends" in str(found.unchecked[0])
     invoke("verify", tmp_path / "r", code=3)
+    for to in ("rlds", "minari"):
+        invoke("export", tmp_path / "r", "--to", to, "--out", tmp_path / to, code=0)
 
 
 def test_another_model_of_the_same_code_is_another_task(tmp_path, monkeypatch):
