@@ -592,7 +592,7 @@ def _difference(one: Layer, other: Layer) -> str:
         had, asked = one.rows - 1, other.rows - 1
         return f"{one.name} has --max-steps {had}, asked for {asked}; give it too, or choose another --out"
     if field == "code":
-        return f"the code of {one.name}'s task has changed since; choose another --out"
+        return f"the code of your own behind {one.name} has changed since; choose another --out"
     images = field == "arrays" and other.kind == "images"
     paint = f"add these images with `paint --size {other.arrays[0].shape[0]}`, or " if images else ""
     return f"{one.name} has {field} {shortened(first)}, asked for {shortened(second)}; {paint}choose another --out"
