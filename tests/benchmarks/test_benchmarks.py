@@ -28,44 +28,29 @@ from dmcvb_gen.benchmarks.evaluate import Evaluator, TrainedAgent
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, BUDGETS, Cell, paper_score, plan_benchmark
 from dmcvb_gen.benchmarks.report import _groups, compare, comparison
 from dmcvb_gen.dataset import Release
-from dmcvb_gen.dataset.manifest import ArraySpec, Layer, Resolved, ShardRecord, SubsetRecord
+from dmcvb_gen.dataset.manifest import ShardRecord
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.generate.resolve import resolve
 from dmcvb_gen.parallel import Needs, Ray, SerialPool
 from dmcvb_gen.parallel.ray_pool import share_of_node
 from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.tasks import get_task
+from tests.conftest import small_recipe
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples" / "extending"
 
 
-def release_of(*names, episodes=100, committed=None, shape=(), **facts):
+def release_of(*names, episodes=100, committed=None, **goals):
     """A release of subsets without data, enough to plan with; its shards of ten are committed, or the first few."""
-    records, layers = [], []
+    subsets = []
     for name in names:
         task, level, setting = name.split("/")
-        own = facts if setting == "fixed" else {}
-        if task.startswith("ant-maze"):
-            views = get_task(task).views
-            own = own | dict(family="ant-maze", views=views, hidden_goal=setting != "visible")
-        own = own | dict(task=task, level=level, setting=setting, episodes=episodes, layers=(f"{name}/trajectories",))
-        own = dict(size=64, max_steps=get_task(task).max_steps) | dict(shape) | own
-        records.append(SubsetRecord(name=name, **own))
-        layers.append(
-            Layer(
-                name=f"{name}/trajectories",
-                group=f"{name}.zarr/trajectories",
-                kind="trajectories",
-                rows=records[-1].max_steps + 1,
-                episodes_per_shard=10,
-                arrays=(ArraySpec(name="length", dtype="int32", steps=False),),
-                makes={"seed": 0},
-            )
-        )
-    told = dict(name="x", version="1", license="x", layers=tuple(layers), subsets=tuple(records))
-    resolved = Resolved.model_construct(**told)  # subsets without labels
+        counts = goals if setting == "fixed" else {"episodes": episodes}
+        subsets.append({"tasks": task, "levels": level, "settings": setting, "episodes_per_shard": 10} | counts)
+    resolved = resolve(small_recipe(subsets=subsets), pixels=False).resolved
     release = Release(open_store("nowhere"), resolved, None, False, None)
-    for layer in layers:
+    for layer in resolved.layers:
         shards = range((committed or episodes) // 10)
         release._records[layer.name] = {n: ShardRecord(key=layer.job_key(n), files={}) for n in shards}
     return release
@@ -207,34 +192,15 @@ def test_a_cell_is_read_back_from_its_facts():
 # -- online evaluation ----------------------------------------------------------------------------
 
 
-class Recorder:
-    """A network that moves a little, the same way every time, and remembers what it saw."""
-
-    half = False
-
-    def __init__(self, size):
-        self.size, self.seen = size, []
-
-    def precision(self):
-        return torch.autocast("cpu", enabled=False)
-
-    def parameters(self):
-        return iter([torch.zeros(1)])
-
-    def act(self, observation):
-        self.seen.append(observation.clone())
-        return torch.full((len(observation), self.size), 0.1)
-
-    def trained(self, normalization):
-        return TrainedAgent(parse_agent("state-bc"), None, self, normalization)
-
-
 def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
     subset = Release.open(small_release)["walker-walk/random/none"]
     normalization = Normalization(torch.full((24,), 0.5), torch.full((24,), 2.0))
     evaluator = Evaluator(subset, pixels=False, episodes=3, max_steps=6)
-    policy = Recorder(6)
-    score = evaluator.score(policy.trained(normalization))
+    agent, seen = parse_agent("state-bc"), []
+    sizes = load_data(subset.release, [Slice(subset.name)], pixels=False).sizes
+    policy = make_policy(agent, make_encoder(agent, sizes), sizes)
+    policy.act = lambda states: seen.append(states.clone()) or torch.full((len(states), 6), 0.1)
+    score = evaluator.score(TrainedAgent(agent, sizes, policy, normalization))
     batch, returns = evaluator.task.batch(3), np.zeros(3)
     states = [batch.reset(evaluator.streams("initial_state"))]
     for _ in range(6):
@@ -244,7 +210,7 @@ def test_scores_are_the_tasks_rewards_and_states_are_normalized(small_release):
     np.testing.assert_allclose(score.returns, returns, rtol=1e-6)
     assert score.mean == pytest.approx(returns.mean())
     assert score.stderr == pytest.approx(returns.std(ddof=1) / np.sqrt(3))
-    np.testing.assert_allclose(policy.seen[4], (states[4] - 0.5) / 2, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(seen[4], (states[4] - 0.5) / 2, rtol=1e-5, atol=1e-5)
     assert score.success is None and score.pictures is None
 
 
@@ -272,16 +238,13 @@ def test_evaluation_episodes_are_no_releases_episodes(small_release):
 
 
 def test_mazes_are_scored_by_success_and_start_where_the_pair_says():
-    subset = release_of(f"{MAZE}/expert/fixed")[f"{MAZE}/expert/fixed"]
-    task = get_task("ant-maze-empty7x7")
-    normalization = Normalization(torch.zeros(task.state_size), torch.ones(task.state_size))
+    name, task, seen = f"{MAZE}/expert/fixed", get_task(MAZE), []
+    subset = release_of(name, fixed_goals=5, episodes_per_goal=20)[name]
     evaluator = Evaluator(subset, pixels=False, episodes=2, max_steps=3, pair=((1, 1), (5, 5)))
-    policy = Recorder(8)
-    score = evaluator.score(policy.trained(normalization))
+    score = evaluator.score(lambda observation: seen.append(observation["state"]) or np.full((2, 8), 0.1))
     assert score.success == 0.0 and score.speed is None and score.mean < 0
-    place = policy.seen[0][:, task.state_slices["walker_position"]]
-    start = torch.as_tensor(task.layout.world((1, 1)), dtype=place.dtype)
-    assert (place[:, :2] - start).abs().max() <= 0.25 + 1e-5 and not torch.equal(place[0], place[1])
+    place = seen[0][:, task.state_slices["walker_position"]]
+    assert np.abs(place[:, :2] - task.layout.world((1, 1))).max() <= 0.25 + 1e-5 and (place[0] != place[1]).any()
 
 
 # -- running cells --------------------------------------------------------------------------------
