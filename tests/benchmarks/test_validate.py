@@ -6,10 +6,6 @@ import errno
 import json
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +33,6 @@ from dmcvb_gen.benchmarks.evaluate import load_agent
 from dmcvb_gen.benchmarks.plan import BUDGETS, Cell, goal_cells, only, plan_benchmark
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, _tables, curve_figures, render_page
 from dmcvb_gen.benchmarks.validate import validate
-from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.manifest import PolicyRecord, record_path
 from dmcvb_gen.errors import DmcvbError
@@ -517,25 +512,6 @@ def test_returns_unlike_the_papers_are_a_warning(release, small_release):
     subset.__dict__["returns"] = np.array([400.0, 402.0])
     [finding] = check_paper_returns(subset)
     assert finding.check == "paper" and "the paper's is 957.8" in finding.message
-
-
-@pytest.mark.slow
-def test_a_stopped_validation_takes_its_workers_with_it(small_release, tmp_path):
-    command = [sys.executable, "-m", "dmcvb_gen", "validate", str(small_release), "--profile", "quick"]
-    command += ["--agents", "bc", "--train-unsound", "--workers", "2", "--out", str(tmp_path)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    children, deadline = Path(f"/proc/{process.pid}/task/{process.pid}/children"), time.time() + 240
-    while len(started := children.read_text().split()) < 3 and time.time() < deadline:  # two, and Python's tracker
-        assert process.poll() is None, "it ended by itself"
-        time.sleep(0.1)
-    assert len(started) == 3
-    time.sleep(5)  # they are at work
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == INTERRUPTED
-    deadline = time.time() + 20
-    while any(Path(f"/proc/{pid}").exists() for pid in started) and time.time() < deadline:
-        time.sleep(0.1)
-    assert not any(Path(f"/proc/{pid}").exists() for pid in started)
 
 
 # -- mazes: goals visible, hidden, fixed ------------------------------------------------------------
