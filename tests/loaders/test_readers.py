@@ -48,31 +48,6 @@ def test_xarray_is_lazy_and_holds_every_array(subset):
         subset.xarray([9])
 
 
-@pytest.mark.parametrize("in_memory", [False, True])
-def test_a_frame_stack_holds_the_frames_before_and_repeats_the_first(subset, in_memory):
-    data, episode = subset.torch("steps", in_memory=in_memory), subset.episode(1)
-    assert len(data) == 1500
-    for step in (0, 1, 2, 499):
-        item = data[500 + step]
-        frames = [episode["pixels"][max(step - back, 0)].transpose(2, 0, 1) for back in (2, 1, 0)]
-        np.testing.assert_array_equal(item["pixels"], np.concatenate(frames))
-        np.testing.assert_array_equal(item["state"], episode["state"][step])
-        np.testing.assert_array_equal(item["action"], episode["action"][step])
-        assert item["reward"] == episode["reward"][step] and (item["episode"], item["step"]) == (1, step)
-    with pytest.raises(IndexError):
-        data[1500]
-
-
-@pytest.mark.parametrize("in_memory", [False, True])
-def test_a_transition_leads_to_the_next_observation(subset, in_memory):
-    item = subset.torch("transitions", in_memory=in_memory, stack=2)[999]
-    episode = subset.episode(1)
-    np.testing.assert_array_equal(item["next_state"], episode["state"][500])
-    np.testing.assert_array_equal(item["next_pixels"][-3:], episode["pixels"][500].transpose(2, 0, 1))
-    np.testing.assert_array_equal(item["next_pixels"][:3], item["pixels"][-3:])
-    assert item["discount"] == 1
-
-
 def test_every_mode_gives_the_same_shapes(subset):
     """Rewards of (64, 1) in one mode and (64,) in another broadcast silently in a loss."""
     kinds = {
@@ -119,12 +94,6 @@ def test_the_source_is_numpy_alone_and_takes_any_index(subset):
             held.gather(wrong)
 
 
-def test_whole_episodes_have_one_observation_more_than_actions(subset):
-    item = subset.torch("episodes")[2]
-    assert item["pixels"].shape == (501, 3, 16, 16) and item["action"].shape == (500, 6)
-    np.testing.assert_array_equal(item["pixels"][500], subset.episode(2)["pixels"][500].transpose(2, 0, 1))
-
-
 def test_batches_pass_over_every_step_once_in_an_order_that_the_seed_decides(subset):
     one = list(subset.batches(64, seed=1, buffer=2))
     assert [len(batch["step"]) for batch in one] == [64] * 23 + [28]
@@ -132,23 +101,7 @@ def test_batches_pass_over_every_step_once_in_an_order_that_the_seed_decides(sub
     assert keys(one) == keys(subset.batches(64, seed=1, buffer=2))
     other = keys(subset.batches(64, seed=2, buffer=2))
     assert keys(one) != other != keys(subset.batches(64, seed=2, epoch=1, buffer=2))
-    batch, episodes = one[5], {e: subset.episode(e) for e in range(3)}
-    for row in range(64):
-        episode, step = episodes[int(batch["episode"][row])], int(batch["step"][row])
-        np.testing.assert_array_equal(batch["pixels"][row, -3:], episode["pixels"][step].transpose(2, 0, 1))
-        np.testing.assert_array_equal(batch["action"][row], episode["action"][step])
     assert [len(batch["step"]) for batch in subset.batches(64, drop_last=True)] == [64] * 23
-
-
-def test_every_way_to_read_gives_the_views_that_agents_see(maze_release):
-    maze = next(iter(dmcvb_gen.open(maze_release).subsets.values()))
-    first = maze.source(pictures="agents")[0]["pixels"]
-    assert first.shape == (27, 16, 16)  # three frames of three views, without the overhead view
-    [batch] = maze.batches(10_000, pictures="agents", shuffle=False)
-    np.testing.assert_array_equal(batch["pixels"][0], first)
-    assert maze.torch("steps", pictures="agents")[0]["pixels"].shape == (27, 16, 16)
-    assert maze.torch("episodes", pictures="agents")[0]["pixels"].shape[1:] == (9, 16, 16)
-    assert next(iter(maze.batches(4)))["pixels"].shape[1:] == (36, 16, 16)
 
 
 def test_a_mask_chooses_episodes_and_other_values_are_refused(subset):
@@ -181,10 +134,6 @@ def test_loader_workers_share_the_episodes(subset):
     loaded = keys(DataLoader(data, batch_size=None, num_workers=2))
     assert "pixels" not in next(iter(data))
     assert len(loaded) == 1500 and set(loaded) == EVERY_STEP
-    again = keys(DataLoader(data, batch_size=None, num_workers=2))
-    assert loaded == again
-    data.set_epoch(1)
-    assert keys(DataLoader(data, batch_size=None, num_workers=2)) != loaded
 
 
 @pytest.mark.slow_cases("spawn")
