@@ -60,20 +60,20 @@ STAIRS = np.concatenate([np.full(40, 300.0), np.linspace(300, 1000, 20), np.full
 COLLAPSE = np.concatenate([rising()[:40], np.full(35, 1000.0), np.linspace(1000, 50, 25)])
 
 
-@pytest.mark.parametrize(
-    ("given", "end", "first", "last"),
-    [
-        (dict(returns=rising()), 1000, 38_000, 38_000),
-        (dict(returns=rising(), noise=30.0), 1000, 37_000, 44_000),
-        (dict(returns=LUCKY, fresh=rising()), 1000, 38_000, 38_000),  # twenty lucky episodes; fresh ones say half
-        (dict(returns=STAIRS), 1000, 58_000, 60_000),  # a plateau before the top is not convergence of the whole
-        (dict(returns=COLLAPSE), 1000, 38_000, 38_000),
-        (dict(returns=rising(top=-50.0, base=-450.0), base=-450.0), -50, 38_000, 38_000),
-        (dict(returns=np.array([10.0, 300.0])), 300, 2000, 2000),
-    ],
-    ids=["plain", "noise", "luck", "stairs", "collapse", "costs", "two evaluations"],
-)
-def test_expert_is_the_first_at_95_percent_of_the_way_and_medium_lies_at_half(given, end, first, last):
+CURVES = {
+    "plain": (dict(returns=rising()), 1000, 38_000, 38_000),
+    "noise": (dict(returns=rising(), noise=30.0), 1000, 37_000, 44_000),
+    "luck": (dict(returns=LUCKY, fresh=rising()), 1000, 38_000, 38_000),  # twenty lucky episodes; fresh ones say half
+    "stairs": (dict(returns=STAIRS), 1000, 58_000, 60_000),  # a plateau before the top is no convergence of the whole
+    "collapse": (dict(returns=COLLAPSE), 1000, 38_000, 38_000),
+    "costs": (dict(returns=rising(top=-50.0, base=-450.0), base=-450.0), -50, 38_000, 38_000),
+    "two evaluations": (dict(returns=np.array([10.0, 300.0])), 300, 2000, 2000),
+}
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_expert_is_the_first_at_95_percent_of_the_way_and_medium_lies_at_half(curve):
+    given, end, first, last = CURVES[curve]
     found, base = select(**given), given.get("base", 0.0)
     assert found.convergence.converged and found.convergence.value == pytest.approx(end, abs=0.02 * (end - base))
     [expert] = found.picks["expert"]
@@ -83,15 +83,15 @@ def test_expert_is_the_first_at_95_percent_of_the_way_and_medium_lies_at_half(gi
         assert (found.picks["medium"][0].evaluation.mean - base) / (end - base) == pytest.approx(0.5, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("returns", "level", "words"),
-    [
-        (np.linspace(10, 1000, 100), "expert", "still rises"),
-        (rising()[:1], "expert", "1 evaluation, at least 2 are needed"),
-        (np.full(100, -3.0), "medium", "never rose"),
-        (np.repeat([20.0, 1000.0], [30, 70]), "mixed", "evaluate more often"),  # jumps over the half
-    ],
-)
+UNPICKED = [
+    (np.linspace(10, 1000, 100), "expert", "still rises"),
+    (rising()[:1], "expert", "1 evaluation, at least 2 are needed"),
+    (np.full(100, -3.0), "medium", "never rose"),
+    (np.repeat([20.0, 1000.0], [30, 70]), "mixed", "evaluate more often"),  # jumps over the half
+]
+
+
+@pytest.mark.parametrize("returns, level, words", UNPICKED)
 def test_what_cannot_be_picked_says_why(returns, level, words):
     found = select(returns)
     assert words in found.reasons[level] and level not in found.picks
@@ -109,15 +109,15 @@ def test_mixed_is_even_in_training_steps_not_in_return():
     assert sum(pick.evaluation.mean < 20 for pick in found.picks["mixed"]) == 6
 
 
-@pytest.mark.parametrize(
-    ("returns", "value", "error", "converged", "words"),
-    [
-        ([10.0, 300.0], 300.0, 290.0, True, "300.0 +- 290.0 (converged: from 2 evaluations, so a longer run may end"),
-        ([0.0, 100.0, 200.0, 210.0, 205.0], 205.0, 155.0, True, "from 5 evaluations"),
-        ([-9.0, -8.0, -8.0], -8.0, 1.0, False, "never rose"),
-        ([5.0], 5.0, None, False, "5.0 (not converged: 1 evaluation, at least 2 are needed)"),
-    ],
-)
+FEW = [
+    ([10.0, 300.0], 300.0, 290.0, True, "300.0 +- 290.0 (converged: from 2 evaluations, so a longer run may end"),
+    ([0.0, 100.0, 200.0, 210.0, 205.0], 205.0, 155.0, True, "from 5 evaluations"),
+    ([-9.0, -8.0, -8.0], -8.0, 1.0, False, "never rose"),
+    ([5.0], 5.0, None, False, "5.0 (not converged: 1 evaluation, at least 2 are needed)"),
+]
+
+
+@pytest.mark.parametrize("returns, value, error, converged, words", FEW)
 def test_a_few_evaluations_are_enough_and_say_how_sure_they_are(returns, value, error, converged, words):
     end = converge(list(range(len(returns))), returns)
     assert (end.value, end.converged) == (value, converged) and words in end.standing
