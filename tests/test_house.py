@@ -1,10 +1,9 @@
-"""The house: every module can be imported, and imports point down alone, without a circle."""
+"""The house: imports point down alone, without a circle."""
 
 from __future__ import annotations
 
 import ast
 import graphlib
-import importlib
 from pathlib import Path
 
 import pytest
@@ -56,12 +55,6 @@ def floor_of(name: str) -> str:
     return "cli" if name in ("dmcvb_gen", "dmcvb_gen.__main__") else name.split(".")[1]
 
 
-def test_every_module_can_be_imported():
-    for name in modules():
-        if name != "dmcvb_gen.__main__":  # which runs the command
-            importlib.import_module(name)
-
-
 def test_arrows_point_down():
     height = {floor: number for number, floor in enumerate(FLOORS, 1)}
     wrong = set()
@@ -84,15 +77,15 @@ def test_the_architecture_names_every_package_and_no_other():
     assert named == {path.parent.name for path in ROOT.glob("*/__init__.py")}
 
 
-@pytest.mark.parametrize(
-    ("statement", "heavy"),
-    [
-        ("import dmcvb_gen.dataset, dmcvb_gen.spec", ("mujoco", "torch")),
-        ("main(['list'])", ("numba", "scipy", "torch", "zarr", "xarray", "matplotlib")),
-        ("main(['info', RELEASE])", ("numba", "scipy", "torch", "mujoco", "dm_control", "xarray", "matplotlib")),
-        ("main(['--help'])", ("numpy", "rich", "pydantic", "zarr", "mujoco")),
-    ],
-)
+LIGHT = [
+    ("import dmcvb_gen.dataset, dmcvb_gen.spec", ("mujoco", "torch")),
+    ("main(['list'])", ("numba", "scipy", "torch", "zarr", "xarray", "matplotlib")),
+    ("main(['info', RELEASE])", ("numba", "scipy", "torch", "mujoco", "dm_control", "xarray", "matplotlib")),
+    ("main(['--help'])", ("numpy", "rich", "pydantic", "zarr", "mujoco")),
+]
+
+
+@pytest.mark.parametrize("statement, heavy", LIGHT)
 def test_what_reads_and_shows_loads_no_simulator(statement, heavy, small_release):
     code = f"""import functools, sys
 from dmcvb_gen import cli

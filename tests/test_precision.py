@@ -15,15 +15,15 @@ SMALL = ("warmup_steps=8", "simulations=4", "batch_size=8", "compile=false")
 SHORT = ["--steps=12", *(f"--set={pair}" for pair in SMALL)]
 
 
-@pytest.mark.parametrize(
-    ("flags", "chosen"),
-    [
-        ("fpu sse avx2 avx512f avx512_bf16", "bfloat16"),
-        ("fpu avx512_bf16 amx_bf16 amx_tile", "bfloat16"),
-        ("fpu avx2 avx512f avx512_vnni", "float32"),
-        (None, "float32"),
-    ],
-)
+PROCESSORS = [
+    ("fpu sse avx2 avx512f avx512_bf16", "bfloat16"),
+    ("fpu avx512_bf16 amx_bf16 amx_tile", "bfloat16"),
+    ("fpu avx2 avx512f avx512_vnni", "float32"),
+    (None, "float32"),
+]
+
+
+@pytest.mark.parametrize("flags, chosen", PROCESSORS)
 def test_the_processors_flags_decide(tmp_path, monkeypatch, flags, chosen):
     if flags:
         (tmp_path / "cpuinfo").write_text(f"processor\t: 0\nflags\t\t: {flags}\nbugs\t\t: amx_bf16_is_no_flag\n")
