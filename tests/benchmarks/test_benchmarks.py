@@ -332,15 +332,15 @@ class Cluster(SerialPool):
         return 4_000_000
 
 
-@pytest.mark.parametrize(
-    "workers, change, expected",
-    [
-        (4, {"memory": 1000}, 250),
-        (Ray("nowhere:1"), {}, 2_000_000),
-        (Ray("nowhere:1"), {"memory": 1000}, 1000),
-        (Ray("nowhere:1"), {"device": "cuda"}, None),  # a cell has a GPU, and its memory, alone
-    ],
-)
+SHARES_OF_MEMORY = [
+    (4, {"memory": 1000}, 250),
+    (Ray("nowhere:1"), {}, 2_000_000),
+    (Ray("nowhere:1"), {"memory": 1000}, 1000),
+    (Ray("nowhere:1"), {"device": "cuda"}, None),  # a cell has a GPU, and its memory, alone
+]
+
+
+@pytest.mark.parametrize("workers, change, expected", SHARES_OF_MEMORY)
 def test_cells_take_no_more_memory_than_their_share(small_release, tmp_path, monkeypatch, workers, change, expected):
     held = []
     pool = Cluster if isinstance(workers, Ray) else SerialPool
