@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import subprocess
 import sys
@@ -12,16 +10,6 @@ import pytest
 
 from dmcvb_gen import files
 from tests.faults.inject import files_up_to
-
-
-def test_bytes_text_and_json_are_put_in_place(tmp_path):
-    files.write_bytes(tmp_path / "deep/er/a.bin", b"\0\1")
-    files.write_text(tmp_path / "a.txt", "grüße\n")
-    files.write_json(tmp_path / "a.json", {"b": [1, None]})
-    assert (tmp_path / "deep/er/a.bin").read_bytes() == b"\0\1"
-    assert (tmp_path / "a.txt").read_text("utf-8") == "grüße\n"
-    assert json.loads((tmp_path / "a.json").read_text()) == {"b": [1, None]}
-    assert files.sha256_file(tmp_path / "a.txt") == hashlib.sha256("grüße\n".encode()).hexdigest()
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
