@@ -1,4 +1,4 @@
-"""TD3-BC written from the paper's equations alone, for tests: functions of weights that share nothing with our learner.
+"""TD3-BC written from the paper's equations alone, for tests: it shares nothing with our learner but torch's Adam.
 
 Fujimoto & Gu 2021, and DMC-VB's appendix "Agent details": critics learn y = r + gamma d min(Q1', Q2')(s', a~); every
 second step the actor minimizes - lambda Q1(s, pi(s)) + |pi(s) - a|^2, lambda = alpha / mean |Q1|, and targets follow
@@ -33,45 +33,30 @@ def value(w, name, s, a):
     return mlp(w, name, torch.cat([trunk(w, "critic_trunk", s), a], 1))[:, 0]
 
 
-class Adam:
-    """Kingma & Ba 2015, with the usual decays."""
-
-    def __init__(self):
-        self.m, self.v, self.t = {}, {}, 0
-
-    def step(self, w, grads):
-        self.t += 1
-        for name, g in grads.items():
-            m = self.m[name] = 0.9 * self.m.get(name, 0) + 0.1 * g
-            v = self.v[name] = 0.999 * self.v.get(name, 0) + 0.001 * g * g
-            w[name] = w[name] - RATE * (m / (1 - 0.9**self.t)) / ((v / (1 - 0.999**self.t)).sqrt() + 1e-8)
+def adam(w, *parts):
+    return torch.optim.Adam([weight for name, weight in w.items() if name.startswith(parts)], lr=RATE)
 
 
-def gradients(w, loss, parts):
-    """Of a loss of weights, by the weights whose names begin with one of `parts`."""
-    names = [name for name in w if name.startswith(parts)]
-    held = w | {name: w[name].detach().requires_grad_() for name in names}
-    return dict(zip(names, torch.autograd.grad(loss(held), [held[name] for name in names]), strict=True))
+def minimize(optimizer, loss):
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
 
 
 def train(w, batches, noises):
     """Weights after a step on each batch (s, a, r, d, s'), with the given target noise."""
-    target, critic, actor = dict(w), Adam(), Adam()
+    w, target = ({name: weight.clone() for name, weight in w.items()} for _ in range(2))
+    for weight in w.values():
+        weight.requires_grad_()
+    critic, actor = adam(w, "critic1", "critic2"), adam(w, "actor.", "actor_trunk", "critic_trunk")
     for step, ((s, a, r, d, after), noise) in enumerate(zip(batches, noises, strict=True)):
         smoothed = (act(target, after) + (NOISE * noise).clamp(-CLIP, CLIP)).clamp(-1, 1)
         least = torch.minimum(value(target, "critic1", after, smoothed), value(target, "critic2", after, smoothed))
         y = r + GAMMA * d * least
-
-        def critic_loss(w, s=s, a=a, y=y):
-            return sum(((value(w, name, s, a) - y) ** 2).mean() for name in ("critic1", "critic2"))
-
-        def actor_loss(w, s=s, a=a):
+        minimize(critic, sum(((value(w, name, s, a) - y) ** 2).mean() for name in ("critic1", "critic2")))
+        if step % 2:
             chosen = act(w, s)
             q = value(w, "critic1", s, chosen)
-            return -ALPHA / q.abs().mean().detach() * q.mean() + ((chosen - a) ** 2).mean()
-
-        critic.step(w, gradients(w, critic_loss, ("critic1", "critic2")))
-        if step % 2:
-            actor.step(w, gradients(w, actor_loss, ("actor.", "actor_trunk", "critic_trunk")))
-            target = {name: KEEP * target[name] + (1 - KEEP) * w[name] for name in w}
-    return w
+            minimize(actor, -ALPHA / q.abs().mean().detach() * q.mean() + ((chosen - a) ** 2).mean())
+            target = {name: KEEP * target[name] + (1 - KEEP) * w[name].detach() for name in w}
+    return {name: weight.detach() for name, weight in w.items()}

@@ -17,23 +17,8 @@ from dmcvb_gen.agents.laom import LatentActionObservationModel, SupervisedLatent
 from dmcvb_gen.agents.lapo import CODE_WIDTH, LatentActionPolicy
 from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.agents.muon import Muon, is_hidden_matrix
-from dmcvb_gen.agents.networks import (
-    PAPER,
-    PATCHES,
-    Architecture,
-    FrameDifferences,
-    ObservationDecoder,
-    observation_encoder,
-    state_encoder,
-)
-from dmcvb_gen.agents.paper import (
-    Autoencoder,
-    BehaviorCloning,
-    InverseDynamics,
-    LatentForwardDynamics,
-    StatePrediction,
-    StateProbe,
-)
+from dmcvb_gen.agents.networks import PATCHES, Architecture, FrameDifferences, ObservationDecoder, observation_encoder
+from dmcvb_gen.agents.paper import Autoencoder, BehaviorCloning, InverseDynamics, LatentForwardDynamics, StateProbe
 from dmcvb_gen.agents.probe import linear_probe
 from dmcvb_gen.agents.td3_bc import TD3BC
 from dmcvb_gen.agents.trainer import Budget, train
@@ -70,6 +55,10 @@ def small_encoder(seed=0):
     return observation_encoder(CHANNELS, SIZE)
 
 
+def state_encoder():
+    return make_encoder(parse_agent("state-bc"), STATE_SIZES)
+
+
 def moved(learner, *batches):
     """Names of the parameters that change in an update on each batch."""
     before = {name: value.clone() for name, value in learner.named_parameters()}
@@ -82,7 +71,7 @@ def moved(learner, *batches):
 
 
 @pytest.mark.parametrize("size", [16, 47, 50, 64])
-@pytest.mark.parametrize("architecture", [PAPER, PATCHES, Architecture((4, 8, 8, 16), (2, 2, 2, 1))])
+@pytest.mark.parametrize("architecture", [BUDGETS["paper"].network, PATCHES, Architecture((4, 8, 8, 16), (2, 2, 2, 1))])
 def test_pictures_of_any_size_are_encoded_and_decoded_to_that_size(size, architecture):
     encoder = observation_encoder(9, size, architecture)
     pictures = torch.zeros(2, 9, size, size)
@@ -92,7 +81,7 @@ def test_pictures_of_any_size_are_encoded_and_decoded_to_that_size(size, archite
 
 
 def test_weights_start_orthogonal():
-    weight = state_encoder(24).trunk[0].weight
+    weight = state_encoder().trunk[0].weight
     torch.testing.assert_close(weight.T @ weight, torch.eye(24), atol=1e-5, rtol=0)
 
 
@@ -131,10 +120,10 @@ def test_the_papers_table_of_hyperparameters_holds_row_by_row():
     Left out is "Actor, Critic 1 and Critic 2: output dimension 64": an actor gives an action, a critic one value.
     """
     paper, budget = Sizes(STATES, ACTIONS, 9, 64, 3), BUDGETS["paper"]
-    encoder, by_state, decoder = observation_encoder(9), state_encoder(STATES), ObservationDecoder(9)
+    encoder, by_state, decoder = observation_encoder(9), state_encoder(), ObservationDecoder(9)
     identify, identify_k = (InverseDynamics(encoder, paper, k=k, sample=k > 1) for k in (1, 5))
-    forward, trained = LatentForwardDynamics(encoder, paper), make_pretrainer(parse_agent("id+bc"), encoder, paper)
-    td3, bc = TD3BC(encoder, paper), BehaviorCloning(encoder, paper)
+    trained, predictor = (make_pretrainer(parse_agent(name), encoder, paper) for name in ("id+bc", "state+bc"))
+    td3, bc, forward = (make(encoder, paper) for make in (TD3BC, BehaviorCloning, LatentForwardDynamics))
     moved_by_actor = {id(p) for group in td3.optimizers["actor"].param_groups for p in group["params"]}
     rows = {
         ("Observation encoder", "frames"): (3, parse_agent("bc").stack),
@@ -149,7 +138,7 @@ def test_the_papers_table_of_hyperparameters_holds_row_by_row():
         ("State encoder", "input, activation, output"): (
             (STATES, ("tanh",), 64), (by_state.trunk[0].in_features, activations(by_state), by_state.features)
         ),
-        ("State predictor layer", "output"): ((STATES,), widths(StatePrediction(encoder, paper).h)),
+        ("State predictor layer", "output"): ((STATES,), widths(predictor.h)),
         ("LFD", "decay"): (0.99, forward.decay),
         ("ID", "embedding, steps, sampled"): (
             (64, 1, False), (identify_k.embed_k.out_features, *(trained.draws[name] for name in ("k", "sample_k")))
@@ -227,7 +216,7 @@ def td3(alpha=2.5, sizes=SIZES):
 
 KINDS = {
     "bc": (lambda: BehaviorCloning(small_encoder(), SIZES), ("encoder", "policy"), 40, 0.05),
-    "bc on states": (lambda: BehaviorCloning(state_encoder(STATES), STATE_SIZES), ("encoder", "policy"), 60, 0.05),
+    "bc on states": (lambda: BehaviorCloning(state_encoder(), STATE_SIZES), ("encoder", "policy"), 60, 0.05),
     "frozen bc": (lambda: BehaviorCloning(small_encoder(), SIZES, frozen=True), ("policy",), 60, 0.05),
     "td3-bc": (lambda: td3(alpha=0.01), ("net.critic1", "net.critic2"), 80, 0.1),  # critics first
     "td3-bc on states": (lambda: td3(0.01, STATE_SIZES), ("net.critic1", "net.critic2"), 150, 0.1),
@@ -239,7 +228,7 @@ KINDS = {
         lambda: LatentForwardDynamics(small_encoder(), SIZES), ("encoder", "embed_action", "g.", "target_"), 40, 0.3
     ),
     "ae": (lambda: Autoencoder(small_encoder(), SIZES), ("encoder", "psi"), 60, 0.7),
-    "state": (lambda: StatePrediction(small_encoder(), SIZES), ("encoder", "h."), 60, 0.3),
+    "state": (lambda: make_pretrainer(parse_agent("state+bc"), small_encoder(), SIZES), ("encoder", "h."), 60, 0.3),
     "lapo": (lambda: LatentActionPolicy(small_encoder(), SIZES), ("encoder", "see", "f.", "g."), 60, 0.9),
     "laom": (
         lambda: LatentActionObservationModel(small_encoder(), SIZES), ("encoder", "see", "f.", "g.", "target"), 60, 0.3
@@ -437,23 +426,21 @@ def test_an_option_that_an_agent_does_not_know_is_refused_with_those_that_it_tak
 # -- DINO -----------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def vision_transformer():
-    """timm's class. A torchvision of another build than torch lacks these two operators, which nothing here calls."""
+@pytest.fixture
+def dino_file(tmp_path):
+    """A tiny network of timm's class with random weights, in a file as timm's.
+
+    A torchvision of another build than torch lacks these two operators, which nothing here calls.
+    """
     operators = torch.library.Library("torchvision", "FRAGMENT")
     for name in ("nms", "qnms"):
         with contextlib.suppress(RuntimeError):  # it is there
             operators.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    yield pytest.importorskip("timm.models.vision_transformer").VisionTransformer
-
-
-@pytest.fixture
-def dino_file(vision_transformer, tmp_path):
-    """A tiny network with random weights, in a file as timm's."""
+    transformers = pytest.importorskip("timm.models.vision_transformer")
     torch.manual_seed(0)
     sizes = dict(img_size=224, patch_size=16, embed_dim=64, depth=2, num_heads=1, mlp_ratio=2, num_classes=3)
-    save_file(vision_transformer(**sizes).state_dict(), str(tmp_path / "dino.safetensors"))
-    return tmp_path / "dino.safetensors"
+    save_file(transformers.VisionTransformer(**sizes).state_dict(), str(tmp_path / "dino.safetensors"))
+    yield tmp_path / "dino.safetensors"
 
 
 def test_dino_gives_every_picture_of_a_stack_its_token_and_never_learns(dino_file):

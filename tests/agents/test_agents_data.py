@@ -79,13 +79,12 @@ def test_transitions_are_those_of_training_episodes_and_never_leave_theirs():
 
 
 def test_the_next_observation_is_k_steps_on_under_the_same_shift():
-    data, pictures = make_data(), pictures_of(make_data())
+    data, shifts = make_data(), torch.cartesian_prod(*[torch.arange(2 * PAD + 1)] * 2).T
     batch = data.batch(64, np.random.default_rng(1), next_observation=True, k=2)
-    for index, row in enumerate(batch.reward.long().tolist()):
-        shifted = {shift: by_hand(pictures, _stack(row), *shift) for shift in np.ndindex(2 * PAD + 1, 2 * PAD + 1)}
-        [shift] = [at for at, seen in shifted.items() if np.allclose(batch.observation[index], seen, atol=1e-6)]
-        following = by_hand(pictures, _stack(row + 2), *shift)
-        np.testing.assert_allclose(batch.next_observation[index], following, atol=1e-6)
+    for index, row in enumerate(batch.reward.long()):
+        seen, following = (data.observe(at.expand(shifts.shape[1]), shifts) for at in (row, row + 2))
+        [shift] = [at for at, one in enumerate(seen) if torch.allclose(one, batch.observation[index], atol=1e-6)]
+        torch.testing.assert_close(batch.next_observation[index], following[shift], atol=1e-6, rtol=0)
 
 
 def test_the_later_observation_is_k_steps_on_and_the_next_one_a_step():
@@ -107,11 +106,6 @@ def test_labeled_transitions_are_those_of_some_episodes_and_tests_are_of_others(
     assert set(rows.tolist()) == {0, 1, 2, 3, 13, 14}
     torch.testing.assert_close(drawn.next_observation, data.observe(rows + 1))
     assert set(data.hold_out_rows.tolist()) == set(range(5, 12)) and set(data.train_rows.tolist()) == {13, 14}
-
-
-def _stack(row):
-    first = {True: 0}.get(row <= 4, 13)
-    return [max(row - 2, first), max(row - 1, first), row]
 
 
 def test_shifts_are_drawn_for_training_unless_left_out_and_not_for_the_hold_out():
@@ -159,10 +153,8 @@ def test_pictures_that_do_not_fit_are_mapped_from_a_file_and_are_the_same(small_
     held, stored = load_data(release, parts), load_data(release, parts, memory=0, scratch=tmp_path)
     assert stored.frames.mapped and not held.frames.mapped and not list(tmp_path.iterdir())
     for hold_out in (False, True):
-        one, two = (
-            data.batch(12, np.random.default_rng(3), next_observation=True, k=5, hold_out=hold_out)
-            for data in (held, stored)
-        )
+        ask = dict(next_observation=True, k=5, hold_out=hold_out)
+        one, two = (data.batch(12, np.random.default_rng(3), **ask) for data in (held, stored))
         torch.testing.assert_close(one.observation, two.observation)
         torch.testing.assert_close(one.next_observation, two.next_observation)
     assert len(held) == 2000
@@ -194,17 +186,15 @@ def test_pictures_that_fit_nowhere_are_refused_with_what_to_do(small_release, tm
         load_data(Release.open(small_release), [Slice("walker-walk/random/none")], memory=0, scratch=tmp_path)
 
 
-TWO = {"episodes": 2}
-
-
 def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small_release):
     release, name = Release.open(small_release), "walker-walk/random/none"
-    half, two, again = (load_data(release, [Slice(name, **part)]) for part in ({"share": 0.5}, TWO, TWO))
+    few = Slice(name, episodes=2)
+    half, two, again = (load_data(release, [part]) for part in (Slice(name, share=0.5), few, few))
     assert (len(half.lengths), len(half), len(half.hold_out_rows)) == (2, 500, 500)
     assert len(load_data(release, [Slice(name, share=0.01)]).lengths) == 1
     assert (len(two.lengths), len(two), len(two.hold_out_rows)) == (2, 1000, 0)  # a counted few are all learned from
     torch.testing.assert_close(again.action, two.action)
-    assert not torch.equal(load_data(release, [Slice(name, **TWO)], seed=5).action, two.action)
+    assert not torch.equal(load_data(release, [few], seed=5).action, two.action)
 
 
 def test_batches_drawn_ahead_come_in_order_and_are_the_same():
