@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -15,9 +11,6 @@ import dmcvb_gen
 from dmcvb_gen.agents.learners import Learner
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.tasks import get_task
-
-ROOT = Path(__file__).parents[2]
-EXAMPLES = ROOT / "docs" / "examples"
 
 
 @pytest.mark.parametrize("where, channels", [("walker-walk/dynamic", 9), ("ant-maze-empty7x7/hidden", 27)])
@@ -120,13 +113,3 @@ def test_image_options_are_refused_without_images(option):
         dmcvb_gen.evaluate(lambda observation: None, "walker-walk/dynamic", pixels=False, **option)
     with pytest.raises(DmcvbError, match="walker-walk/dynamic_camera0.2 shows no videos, so backgrounds"):
         dmcvb_gen.evaluate(lambda observation: None, "walker-walk/dynamic_camera0.2", backgrounds="builtin")
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("example", ["evaluate_torch", "evaluate_jax"])
-def test_examples_train_and_score_a_policy(small_release, example):
-    pytest.importorskip("jax" if "jax" in example else "torch")
-    command = [sys.executable, str(EXAMPLES / f"{example}.py"), str(small_release), "walker-walk/random/dynamic"]
-    shown = subprocess.run([*command, "2", "5"], capture_output=True, text=True, timeout=300, cwd=ROOT)
-    assert shown.returncode == 0, shown.stderr
-    assert "return " in shown.stdout and "over 2 episodes" in shown.stdout
