@@ -10,7 +10,6 @@ import re
 import subprocess
 import sys
 import tomllib
-import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import yaml
 from dmcvb_gen.cli import COMMANDS
 from dmcvb_gen.generate.shipped import load_shipped
 from dmcvb_gen.version import __version__
+from tests.web_server import serving_s3
 
 ROOT = Path(__file__).parent.parent
 SITE = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
@@ -53,18 +53,11 @@ def blocks(page: Path) -> list[Block]:
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory):
     """A reader's folder and environment, with an S3 server that has a bucket named "bucket"."""
-    from moto.server import ThreadedMotoServer
-
-    server = ThreadedMotoServer(port=0, verbose=False)
-    server.start()
-    address = "http://{}:{}".format(*server.get_host_and_port())
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    keys = {"AWS_ACCESS_KEY_ID": "docs", "AWS_SECRET_ACCESS_KEY": "docs", "AWS_DEFAULT_REGION": "us-east-1"}
-    urllib.request.urlopen(urllib.request.Request(f"{address}/bucket", method="PUT")).close()
-    folder, places = tmp_path_factory.mktemp("reader"), {"AWS_ENDPOINT_URL": address, "PATH": path}
-    yield folder, os.environ | keys | places | {"XDG_CACHE_HOME": str(folder / "cache")}
-    urllib.request.urlopen(urllib.request.Request(f"{address}/moto-api/reset", method="POST")).close()
-    server.stop()
+    folder, path = tmp_path_factory.mktemp("reader"), f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    with serving_s3("bucket") as options:
+        login = {"AWS_ACCESS_KEY_ID": options["key"], "AWS_SECRET_ACCESS_KEY": options["secret"]}
+        places = {"AWS_ENDPOINT_URL": options["endpoint_url"], "PATH": path, "XDG_CACHE_HOME": str(folder / "cache")}
+        yield folder, os.environ | login | places | {"AWS_DEFAULT_REGION": "us-east-1"}
 
 
 @pytest.mark.full
