@@ -11,17 +11,7 @@ from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 
 from dmcvb_gen.policies.header import PolicyHeader
-from dmcvb_gen.training.sac import (
-    SUPPORT,
-    CriticEnsemble,
-    ReplayBuffer,
-    ReturnScale,
-    RunningNorm,
-    Sac,
-    Settings,
-    in_order,
-    smoothed,
-)
+from dmcvb_gen.training.sac import SUPPORT, ReplayBuffer, ReturnScale, Sac, Settings, in_order, smoothed
 
 torch.set_num_threads(1)
 
@@ -49,8 +39,7 @@ def batch_of(count=64):
 
 
 def test_the_ensemble_is_two_separate_critics():
-    torch.manual_seed(0)
-    critic = CriticEnsemble(5, (8, 8))
+    critic = learner().critic
     observation, action = torch.randn(5, 3), torch.rand(5, 2)
     both = critic(observation, action)
     for k in range(2):  # each critic by hand
@@ -183,7 +172,7 @@ def test_steps_that_follow_are_summed_as_far_as_an_episode_goes_on(data):
 
 
 def test_running_statistics_are_those_of_all_values():
-    rng, norm, seen = np.random.default_rng(0), RunningNorm(3), []
+    rng, norm, seen = np.random.default_rng(0), learner().norm, []
     for count in (1, 7, 100, 30):
         seen.append(rng.normal(5, 2, (count, 3)))
         norm.update(seen[-1])
