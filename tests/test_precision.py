@@ -11,8 +11,7 @@ from dmcvb_gen import precision
 from dmcvb_gen.training.run import read_config
 from tests.conftest import invoke
 
-SMALL = ("warmup_steps=8", "simulations=4", "batch_size=8", "compile=false")
-SHORT = ["--steps=12", *(f"--set={pair}" for pair in SMALL)]
+SHORT = "--steps=12 --set=warmup_steps=8 --set=simulations=4 --set=batch_size=8 --set=compile=false".split()
 
 
 PROCESSORS = [

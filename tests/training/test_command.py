@@ -135,18 +135,11 @@ def lines_of(folder, task, algorithm="sac", done=0, **given):
     return plan_of(Run(folder, run_config(task, algorithm, settings, **given)), done)
 
 
-FIRST = [
-    ("sac", "walker-walk, sac, float32: 120,000 agent steps, 5,000 of them random."),
-    ("mpo", "walker-walk, mpo: 120,000 agent steps, 5,000 of them random."),
-    ("sb3:TD3", "walker-walk, sb3:TD3: 120,000 agent steps, 100 of them random."),
-]
-
-
-@pytest.mark.parametrize("algorithm, first", FIRST)
-def test_a_run_says_what_it_will_do(tmp_path, monkeypatch, algorithm, first):
+@pytest.mark.parametrize("named, drawn", [("sac, float32", "5,000"), ("mpo", "5,000"), ("sb3:TD3", "100")])
+def test_a_run_says_what_it_will_do(tmp_path, monkeypatch, named, drawn):
     monkeypatch.setattr(behaviour, "PROBE_SECONDS", 0.05)
-    said = lines_of(tmp_path / "run", "walker-walk", algorithm)
-    assert said[0] == first
+    said = lines_of(tmp_path / "run", "walker-walk", named.split(",")[0])
+    assert said[0] == f"walker-walk, {named}: 120,000 agent steps, {drawn} of them random."
     assert re.fullmatch(r"About (\d+ min|[\d.]+ h) of one core, without evaluations \(.*\)\.", said[1])
     assert said[2] == "To expect: 935, as the package's own expert has after 33,000 agent steps."
     assert not (tmp_path / "run").exists() and max(map(len, said)) <= 80
@@ -173,17 +166,17 @@ def test_a_pause_says_nothing_of_the_time_left(tmp_path, monkeypatch):
     assert resumed == [8]
 
 
+def own_task(folder, module, seconds):
+    """Write a task of one's own with short episodes, and give its name."""
+    load = f'suite.load("cartpole", "swingup", task_kwargs=dict(time_limit={seconds}))'
+    (folder / f"{module}.py").write_text(f"from dm_control import suite\n\ndef own():\n    return {load}\n")
+    return f"{module}:own"
+
+
 @pytest.mark.parametrize(("seconds", "warmup"), [(0.4, 1000), (5, 2500), (60, 5000)])
 def test_own_tasks_of_short_episodes_are_learned_soon(tmp_path, monkeypatch, seconds, warmup):
-    code = f"""
-from dm_control import suite
-
-def short():
-    return suite.load("cartpole", "swingup", environment_kwargs={{}}, task_kwargs=dict(time_limit={seconds}))
-"""
-    name = f"short_{str(seconds).replace('.', '_')}"
-    (tmp_path / f"{name}.py").write_text(code)
+    name = own_task(tmp_path, f"short_{str(seconds).replace('.', '_')}", seconds)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv(TASKS, f"{name}:short")
-    assert default_run(f"{name}:short")["settings"] == {"warmup_steps": warmup}
+    monkeypatch.setenv(TASKS, name)
+    assert default_run(name)["settings"] == {"warmup_steps": warmup}
     assert default_run("hopper-hop")["settings"] == {}

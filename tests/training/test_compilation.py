@@ -15,8 +15,7 @@ from dmcvb_gen.compilation import compiled, compiler
 from tests.conftest import MAIN, python
 
 LINE = "Training runs without torch.compile, which is slower"
-SETTINGS = ("warmup_steps=8", "simulations=4", "batch_size=8", "actor_hidden=[8]", "critic_hidden=[8]")
-SMALL = [f"--set={pair}" for pair in SETTINGS]
+SMALL = [f"--set={pair}" for pair in ("warmup_steps=8", "simulations=4", "batch_size=8", "critic_hidden=[8]")]
 
 
 @pytest.fixture(autouse=True)

@@ -119,7 +119,6 @@ def test_a_student_learns_where_its_guide_points(tmp_path, monkeypatch):
 
 # -- a maze of one's own ----------------------------------------------------------------------------
 
-HALL = "****\n*  *\n****\n"
 SHORT = "--steps 448 --evaluate-every 64 --set ramp=200 --set simulations=16 --set width=64"
 """Enough to find the goal in a hall of two cells now and then."""
 
@@ -135,7 +134,7 @@ def test_the_documented_commands_of_ring_txt_take_a_sketch_to_a_verified_release
     monkeypatch.setattr(selection, "select_checkpoints", lambda folder, progress: select(folder, 5, progress=progress))
     monkeypatch.setattr(selection, "MEDIUM_TOLERANCE", 0.6)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "ring.txt").write_text(HALL)
+    (tmp_path / "ring.txt").write_text("****\n*  *\n****\n")
     for command in commands:
         short = {"train-behaviour": SHORT, "rollout": "--size 16 --max-steps 50"}.get(command[0], "").split()
         done = invoke(*command, *short, code=0)

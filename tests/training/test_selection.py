@@ -23,6 +23,7 @@ from dmcvb_gen.training import selection
 from dmcvb_gen.training.networks import Actor, as_arrays
 from dmcvb_gen.training.selection import MIXED_COUNT, converge, pick_checkpoints, read_curve, select_checkpoints
 from tests.conftest import invoke, told
+from tests.training.test_command import own_task
 
 STEPS = np.arange(1, 101) * 1000
 
@@ -196,26 +197,18 @@ def test_a_folder_that_cannot_be_written_to_is_one_line(run_folder, monkeypatch)
         select_checkpoints(run_folder, episodes=2)
 
 
-BRIEFLY = """
-from dm_control import suite
-
-def push():
-    return suite.load("pendulum", "swingup", task_kwargs=dict(time_limit=0.2))
-"""
-
-
 @pytest.mark.slow
 def test_the_command_after_the_training_of_an_own_task_can_be_run_as_it_is(tmp_path, monkeypatch):
-    (tmp_path / "briefly.py").write_text(BRIEFLY)
+    task = own_task(tmp_path, "briefly", 0.2)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(TASKS, "")  # its code is not allowed to run yet
     cut = {"warmup_steps": 10, "simulations": 2, "batch_size": 4, "compile": False, "bfloat16": False}
     words = [word for name, value in cut.items() for word in ("--set", f"{name}={value}")]
-    trained = invoke("train-behaviour", "briefly:push", "--steps", 12, "--out", "run", *words, code=0)
+    trained = invoke("train-behaviour", task, "--steps", 12, "--out", "run", *words, code=0)
     [line] = [line for line in trained.output.splitlines() if line.startswith("Next: ")]
     leave, program, *arguments = shlex.split(line.removeprefix("Next: "))
-    assert (leave, program) == (f"{TASKS}=briefly:push", "dmcvb-gen")
+    assert (leave, program) == (f"{TASKS}={task}", "dmcvb-gen")
     get_task.cache_clear()  # as in a new process
     monkeypatch.setenv(TASKS, leave.removeprefix(f"{TASKS}="))
     selected = invoke(*arguments, "--episodes", 2, code=1)
