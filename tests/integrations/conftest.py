@@ -24,10 +24,6 @@ class Stored:
     def views(self):
         return VIEWS if self.name.startswith("ant-maze") else ("pixels",)
 
-    @property
-    def max_steps(self):
-        return 100 if self.name.startswith("ant-maze") else 500  # as the fixtures ask for
-
     def episode(self, index):
         """(length, arrays by name, "pixels" (L + 1, view, size, size, 3)), without the goal where it must be hidden."""
         task, level, setting = self.name.split("/")
