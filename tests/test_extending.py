@@ -85,9 +85,7 @@ def test_an_agent_of_your_own_is_trained_beside_the_papers_in_every_form(family,
     assert all(result["curve"][-1]["loss"] > 0 for result in report["results"])
 
 
-@pytest.mark.parametrize(
-    "text, told", [(None, "cannot find DMCVB_GEN_PLUGINS mine"), ("1 / 0", "cannot be imported (ZeroDivisionError")]
-)
+@pytest.mark.parametrize("text, told", [(None, "cannot find DMCVB_GEN_PLUGINS mine"), ("1 / 0", "(ZeroDivisionError")])
 def test_a_plugin_that_cannot_be_imported_is_told_in_one_line(text, told, tmp_path, monkeypatch):
     monkeypatch.setenv("DMCVB_GEN_PLUGINS", "mine")
     monkeypatch.chdir(tmp_path)

@@ -36,13 +36,11 @@ CLOSE += [(task, setting) for task in PAINTED for setting in ("none", "dynamic")
 CLOSE += [(task, "dynamic_light0.5") for task in ("walker-walk", "humanoid-walk", "finger-spin")]  # finger's is a sun
 CLOSE = [("walker-walk", "dynamic", 200), *((*case, 64) for case in CLOSE)]
 FAST = [("walker-walk", "dynamic", 200), ("walker-walk", "none", 64), ("walker-walk", "static", 64)]
+CLOSE = [pytest.param(*case, marks=() if case in FAST else pytest.mark.slow) for case in CLOSE]
 
 
 @needs_opengl
-@pytest.mark.parametrize(
-    ("task_id", "setting_name", "size"),
-    [pytest.param(*case, marks=() if case in FAST else pytest.mark.slow) for case in CLOSE],
-)
+@pytest.mark.parametrize("task_id, setting_name, size", CLOSE)
 def test_every_view_is_as_close_to_opengl_as_eyes_see(task_id, setting_name, size):
     task, setting, physics, labels = frames_of(task_id, setting_name)
     pictures = []
