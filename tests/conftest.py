@@ -1,7 +1,5 @@
 """Shared fixtures: a small release that many tests read."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import gc

@@ -6,8 +6,6 @@ by a hundredth. Networks are two ReLU layers with tanh at the end, behind trunks
 loss moves both trunks.
 """
 
-from __future__ import annotations
-
 import torch
 
 ALPHA, GAMMA, NOISE, CLIP, KEEP, RATE = 2.5, 0.99, 0.2, 0.5, 0.99, 1e-3

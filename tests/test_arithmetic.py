@@ -1,7 +1,5 @@
 """Functions of our own against numpy's and scipy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

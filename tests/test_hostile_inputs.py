@@ -3,8 +3,6 @@
 A few dozen of each kind here; `HOSTILE=500 pytest tests/test_hostile_inputs.py` takes five hundred.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 

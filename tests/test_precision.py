@@ -1,7 +1,5 @@
 """Which precision trainings compute in: what the processor has instructions for, never what a stopwatch says."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

@@ -1,7 +1,5 @@
 """One small release of each family goes away without its images, and is painted in another style and size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

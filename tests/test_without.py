@@ -1,7 +1,5 @@
 """Where something is missing, what needs it is refused in one line, and all else works."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.conftest import MAIN, python

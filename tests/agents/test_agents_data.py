@@ -1,7 +1,5 @@
 """Training data and the trainer: the right frames, shifts and split, and the same bits after a stop."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 from types import SimpleNamespace

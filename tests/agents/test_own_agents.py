@@ -1,7 +1,5 @@
 """Policies of one's own, scored by `dmcvb_gen.evaluate`; wrong actions are one line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Benchmarks: the right cells for a release, the paper's numbers, online episodes as the task gives them."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import importlib

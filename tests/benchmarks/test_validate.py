@@ -1,7 +1,5 @@
 """validate: a sound release gives a page and exit code 0; each kind of damage fails by the check meant for it."""
 
-from __future__ import annotations
-
 import errno
 import json
 import re

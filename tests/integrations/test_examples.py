@@ -1,7 +1,5 @@
 """The examples of the documents learn from their data, and their policies are scored."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

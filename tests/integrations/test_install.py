@@ -1,7 +1,5 @@
 """The package as strangers install it: a wheel with all data; reading with hardly anything; rollouts without torch."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

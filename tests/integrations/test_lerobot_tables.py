@@ -1,7 +1,5 @@
 """What LeRobot's layout promises, read with `datasets` and pyarrow (LeRobot itself: by script)."""
 
-from __future__ import annotations
-
 import json
 
 import datasets

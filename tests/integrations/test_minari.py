@@ -1,7 +1,5 @@
 """Minari opens its data sets where it looks for them, and makes the environments that they came from."""
 
-from __future__ import annotations
-
 import minari
 import numpy as np
 import pytest

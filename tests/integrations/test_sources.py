@@ -1,7 +1,5 @@
 """Readers give the stored values, and the pictures that a subset is about in the task's order."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

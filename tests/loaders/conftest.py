@@ -1,7 +1,5 @@
 """Small releases that several tests of readers share."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.conftest import roll_out, small_recipe

@@ -1,7 +1,5 @@
 """Environments: Gymnasium's checker passes; physics, rewards and pictures are those of the tasks and renderers."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """One call for data and the environment that matches them; scores between random actions and the data's expert."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Releases whose images are rendered when they are read: those of the data to the bit, or fresh ones for each epoch."""
 
-from __future__ import annotations
-
 import pickle
 import threading
 

@@ -1,7 +1,5 @@
 """Pairs of images of the same states, stored or rendered on reading; and what an encoder keeps of them."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

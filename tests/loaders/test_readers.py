@@ -1,7 +1,5 @@
 """Readers: every form gives the stored values, whatever workers, ranks and seeds."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

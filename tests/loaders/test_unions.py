@@ -1,7 +1,5 @@
 """Unions of subsets, as D4RL names them: each form of reading gives the steps of both parts, and exports take them."""
 
-from __future__ import annotations
-
 import json
 import pickle
 

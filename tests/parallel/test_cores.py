@@ -1,7 +1,5 @@
 """The cores that a batch system or a container grants are what commands use, not all of the machine's."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """The one process pool: results as they come, progress, and what happens when something dies."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

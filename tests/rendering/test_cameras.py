@@ -1,7 +1,5 @@
 """Kinematics of stored states: MuJoCo's own, the same in any batch, one kept batch a task, also from threads."""
 
-from __future__ import annotations
-
 import copy
 from concurrent.futures import ThreadPoolExecutor
 

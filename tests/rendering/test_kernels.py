@@ -1,7 +1,5 @@
 """Native's hardest kernels against MuJoCo's own rays and against a few lines of numpy."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

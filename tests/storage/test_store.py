@@ -1,7 +1,5 @@
 """What every store does, whatever is behind it; a new implementation adds a class with a fixture."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import multiprocessing

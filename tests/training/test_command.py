@@ -1,7 +1,5 @@
 """The behaviour commands: a policy's header says how to train it again; returns stand beside the paper's."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A training runs uncompiled, and says so in one line, if torch.compile cannot work."""
 
-from __future__ import annotations
-
 import logging
 import os
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Policies that learn the way through a maze: what they learn, and what they may see."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

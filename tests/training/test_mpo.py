@@ -1,7 +1,5 @@
 """MPO: each of its equations against what it should be, and whole runs of it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

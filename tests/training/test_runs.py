@@ -1,7 +1,5 @@
 """Runs of every algorithm: what a folder holds, and that runs that were stopped, killed or out of disk go on."""
 
-from __future__ import annotations
-
 import fcntl
 import io
 import multiprocessing

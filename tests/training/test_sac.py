@@ -1,7 +1,5 @@
 """SAC: each part of its update against what it should be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

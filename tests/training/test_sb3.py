@@ -1,7 +1,5 @@
 """Any algorithm of Stable-Baselines3: what is exported acts as the model does, and runs stop and go on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

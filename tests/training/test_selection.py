@@ -1,7 +1,5 @@
 """Picking checkpoints from curves whose answer is known."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import shlex
