@@ -6,8 +6,6 @@ tests, and back after them. That folder's name is a digest of the source, so oth
 itself compares its own digest of the source, the processor and its version before it uses what it finds.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

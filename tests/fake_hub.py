@@ -1,7 +1,5 @@
 """The Hugging Face Hub in a folder: what we call of `huggingface_hub.HfApi`, and its web server."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import shutil

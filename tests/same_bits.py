@@ -3,8 +3,6 @@
 python -m tests.same_bits <agent steps> <renderer or -> <task>...
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

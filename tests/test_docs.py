@@ -3,8 +3,6 @@
 Pages run in the order of the site, in one folder, with one bucket. A single page runs too: `-k light`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The examples of docs/extending.md: each registers one thing of the user's own, and a public command uses it."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

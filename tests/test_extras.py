@@ -1,7 +1,5 @@
 """One table says which extra brings a module that is missing: every import of another package is in it."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import re
 import sys

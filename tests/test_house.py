@@ -1,7 +1,5 @@
 """The house: imports point down alone, without a circle."""
 
-from __future__ import annotations
-
 import ast
 import graphlib
 from pathlib import Path

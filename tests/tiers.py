@@ -6,8 +6,6 @@ own time is the processor time of its body, in this process and in children that
 not used, because machines are shared; fixtures do not count, because many tests share them.
 """
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Iterator
 

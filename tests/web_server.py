@@ -1,7 +1,5 @@
 """Web servers in threads, for tests: files of a folder with byte ranges, answers that a test writes, and S3."""
 
-from __future__ import annotations
-
 import contextlib
 import http.server
 import re

@@ -1,7 +1,5 @@
 """Agents: sizes as in the paper, gradients where they belong, targets by hand, and each learns what it is shown."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 

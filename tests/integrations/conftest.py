@@ -1,7 +1,5 @@
 """What exports are measured against: the pictures that a subset is about, read with zarr alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Golden pictures fail where a change of ours or of a dependency changes pixels. L
 replace the old: `python -m tests.rendering.test_native` writes all of them again.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 python tests/integrations/heavy/make_exports.py FOLDER lerobot tfds zarr2
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
