@@ -14,7 +14,7 @@ Functions and arguments travel by pickle between processes of one program and us
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 
 from dmcvb_gen.parallel.base import KEPT, Needs, Pool, ProgressCallback, Ray, SerialPool, Workers, expect, ignore
 
@@ -62,11 +62,7 @@ def in_order(function: Callable, items: Sequence, workers: Workers | Pool = 1, t
     Raises:
       StoreError: a worker was killed.
     """
-    if isinstance(workers, Pool):
-        opened: AbstractContextManager[Pool] = nullcontext(workers)
-    else:
-        opened = open_pool(workers, tick=tick, most=len(items))
-    with opened as pool:
+    with nullcontext(workers) if isinstance(workers, Pool) else open_pool(workers, tick=tick, most=len(items)) as pool:
         for number, item in enumerate(items):
             pool.submit(number, function, item)
         results = dict(pool.results())
