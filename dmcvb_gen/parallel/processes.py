@@ -100,10 +100,8 @@ def _without_guardless_main() -> Iterator[None]:
         guarded = "__name__" in Path(getattr(main, "__file__", None) or "").read_text()
     except (OSError, ValueError):  # no script: a notebook, `python -c`
         guarded = True
-    if guarded:
-        yield
-        return
-    sys.modules["__main__"] = types.ModuleType("__main__")
+    if not guarded:
+        sys.modules["__main__"] = types.ModuleType("__main__")
     try:
         yield
     finally:
