@@ -15,6 +15,11 @@ from dmcvb_gen.policies.open_maze import PLACE_SCALE
 _ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
 
 
+def hidden_layers(widths: Sequence[int], activation: type[nn.Module]) -> list[nn.Module]:
+    """Linear layers from each width to the next one, an activation behind each."""
+    return [layer for sizes in itertools.pairwise(widths) for layer in (nn.Linear(*sizes), activation())]
+
+
 class Actor(nn.Module):
     """An MLP from normalized observations to the parameters of the action distribution.
 
@@ -25,16 +30,11 @@ class Actor(nn.Module):
     def __init__(self, header: PolicyHeader):
         super().__init__()
         self.header = header
-        layers: list[nn.Module] = []
-        width = header.observation_size
-        for hidden in header.hidden:
-            layers.append(nn.Linear(width, hidden))
-            layers.append(_ACTIVATIONS[header.activation]())
-            width = hidden
-        self.body = nn.Sequential(*layers)
-        self.mean = nn.Linear(width, header.action_size)
+        widths = (header.observation_size, *header.hidden)
+        self.body = nn.Sequential(*hidden_layers(widths, _ACTIVATIONS[header.activation]))
+        self.mean = nn.Linear(widths[-1], header.action_size)
         if header.distribution == "squashed_gaussian":
-            self.log_std = nn.Linear(width, header.action_size)
+            self.log_std = nn.Linear(widths[-1], header.action_size)
         elif header.distribution == "gaussian":
             self.log_std_vector = nn.Parameter(torch.zeros(header.action_size))
         self.register_buffer("observation_mean", torch.zeros(header.observation_size))
@@ -61,11 +61,8 @@ class WaypointNetwork(nn.Sequential):
     """An MLP from places of ant and goal, (n, `WAY_SIZE`) meters, to where to head, (n, 2) meters seen from the ant."""
 
     def __init__(self, hidden: Sequence[int]):
-        widths = [WAY_SIZE, *hidden]
-        layers: list[nn.Module] = []
-        for fan_in, fan_out in itertools.pairwise(widths):
-            layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
-        super().__init__(*layers, nn.Linear(widths[-1], 2))
+        widths = (WAY_SIZE, *hidden)
+        super().__init__(*hidden_layers(widths, nn.ReLU), nn.Linear(widths[-1], 2))
 
     def forward(self, places: torch.Tensor) -> torch.Tensor:
         return super().forward(places / float(PLACE_SCALE))
