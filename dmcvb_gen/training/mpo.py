@@ -104,10 +104,8 @@ class Mpo(Learner):
         super().__init__(header, settings, seed)
         inputs = header.observation_size + header.action_size
         self.critic = CriticEnsemble(inputs, settings.critic_hidden, settings.critics)
-        self.target_actor = copy.deepcopy(self.actor)
-        self.target = copy.deepcopy(self.critic)
-        for target in (self.target, self.target_actor):
-            target.requires_grad_(False)
+        self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.target = copy.deepcopy(self.critic).requires_grad_(False)
         # Softplus of these: they stay positive whatever the optimizer does.
         starts = (settings.initial_temperature, settings.initial_multiplier_mean, settings.initial_multiplier_std)
         self.duals = nn.Parameter(torch.tensor([value + math.log(-math.expm1(-value)) for value in starts]))
