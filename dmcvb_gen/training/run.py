@@ -350,16 +350,15 @@ class Run:
     @contextlib.contextmanager
     def _stopping_on_signals(self, stopping: Callable[[], Any]) -> Iterator[None]:
         """Ctrl-C and SIGTERM ask the run to stop; more of them change nothing, so a save is never cut off."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
 
         def stop(*_: Any) -> None:
             if not self._asked_to_stop:
                 stopping()
             self._asked_to_stop = True
 
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        in_main = threading.current_thread() is threading.main_thread()  # another thread gets no signals
+        numbers = (signal.SIGINT, signal.SIGTERM) if in_main else ()
+        before = {number: signal.signal(number, stop) for number in numbers}
         try:
             yield
         finally:
