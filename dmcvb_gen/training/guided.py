@@ -194,9 +194,8 @@ def _base_file(run: Run) -> Path:
 def network(run: Run) -> dict[str, Any]:
     """The header's fields that say how the actor is built: as the policy that walks, with a way before it."""
     base = base_policy(run)
-    header = base.header
     kept = ("hidden", "activation", "distribution", "noise", "clip_observation")
-    fields = {name: getattr(header, name) for name in kept}
+    fields = {name: getattr(base.header, name) for name in kept}
     return fields | {"way": (run.settings.width,) * run.settings.layers, "training": {"walker": base.digest}}
 
 

@@ -109,8 +109,8 @@ def make_model(run: Run) -> BaseAlgorithm:
     Raises:
       DmcvbError: SB3 does not accept the settings.
     """
-    theirs = {name: value for name, value in vars(run.settings).items() if name not in OURS}
-    given = copy.deepcopy(theirs)  # SB3 writes into dicts that it is given
+    # A copy, as SB3 writes into dicts that it is given.
+    given = copy.deepcopy({name: value for name, value in vars(run.settings).items() if name not in OURS})
     if isinstance(noise := given.get("action_noise"), int | float):
         given["action_noise"] = NormalActionNoise(np.zeros(run.task.action_size), np.full(run.task.action_size, noise))
     seed = run.config.seed
