@@ -74,12 +74,10 @@ class Store(abc.ABC):
 
     def _pieces(self, path: str, limit: int) -> Iterator[bytes]:
         """A file's bytes piece by piece, `limit` at most."""
-        start = 0
-        while start < limit:
+        for start in range(0, limit, PIECE):
             asked = min(PIECE, limit - start)
             piece = self._read(path, start, asked)
             yield piece
-            start += len(piece)
             if len(piece) < asked:
                 return
 
