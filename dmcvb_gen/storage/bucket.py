@@ -165,9 +165,8 @@ _heeding: set[str] = set()
 def _texts(value: Any) -> Iterator[str]:
     """Every string in an option's value."""
     if isinstance(value, Mapping):
-        for part in value.values():
-            yield from _texts(part)
-    elif isinstance(value, list | tuple):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
         for part in value:
             yield from _texts(part)
     elif isinstance(value, str) and len(value) > 3:
