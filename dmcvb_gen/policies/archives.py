@@ -10,7 +10,6 @@ bytes, then all second ones, ..., because signs and exponents resemble each othe
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import lzma
 import os
@@ -21,7 +20,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import sha256_if_readable, write_bytes
+from dmcvb_gen.files import sha256_bytes, sha256_if_readable, write_bytes
 from dmcvb_gen.spec import is_maze
 
 INDEX = "policies.json"
@@ -121,5 +120,5 @@ def pack(files: Mapping[str, bytes], out: Path) -> None:
         archive.write_bytes(pack_files(dict(sorted(held.items()))))
     listed = json.loads(index.read_text()) if index.exists() else {}
     digests = {name: listed[name] for name in others(listed)}
-    digests |= {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    digests |= {name: sha256_bytes(content) for name, content in files.items()}
     index.write_text(json.dumps(dict(sorted(digests.items())), indent=1) + "\n")

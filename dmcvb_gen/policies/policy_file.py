@@ -5,7 +5,6 @@ Loading one runs no code from the file, allocates no more than the file holds, a
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from safetensors.numpy import load as load_safetensors
 from safetensors.numpy import save as dump_safetensors
 
 from dmcvb_gen.errors import PolicyFileError, first_line
-from dmcvb_gen.files import parse_json, write_bytes
+from dmcvb_gen.files import parse_json, sha256_bytes, write_bytes
 from dmcvb_gen.own_code import is_own
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.header import FORMAT_VERSION, PolicyHeader, weight_shapes
@@ -66,7 +65,7 @@ def _read(path: Path) -> tuple[PolicyHeader, dict[str, np.ndarray], str]:
         raise PolicyFileError(
             f"{path} is not a whole policy file ({reason}); copy it again or export it with select-checkpoints"
         ) from None
-    return header, weights, hashlib.sha256(data).hexdigest()
+    return header, weights, sha256_bytes(data)
 
 
 def load_policy(path: str | Path, task: Task | None = None, sample: bool = False) -> Policy:
