@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import stat
@@ -68,12 +69,10 @@ class LocalStore(Store):
         for parent, folders, names in os.walk(self._at(prefix)):
             folders[:] = [name for name in folders if not name.startswith(".")]
             for path in (Path(parent, name) for name in names):
-                try:
+                with contextlib.suppress(FileNotFoundError):  # another process removed it
                     status = path.lstat()
-                except FileNotFoundError:  # another process removed it
-                    continue
-                if stat.S_ISREG(status.st_mode):
-                    found[path.relative_to(self.folder).as_posix()] = status.st_size
+                    if stat.S_ISREG(status.st_mode):
+                        found[path.relative_to(self.folder).as_posix()] = status.st_size
         return found
 
     def _create(self, path: str, data: bytes | Path) -> None:
