@@ -81,10 +81,9 @@ class PairedArray(ComputedArray):
 
     def __init__(self, name: str, parts: Sequence[Any]):
         first, self._parts = parts[0], parts
-        (episodes, steps, *image), dimensions = first.shape, [*first.dimensions]
-        dimensions.insert(2, "setting")
-        shape = (episodes, steps, len(parts), *image)
-        super().__init__(name, shape, first.dtype, tuple(dimensions), lambda e, rest: self.rows(np.array([e]))[0][rest])
+        shape = (*first.shape[:2], len(parts), *first.shape[2:])
+        dimensions = (*first.dimensions[:2], "setting", *first.dimensions[2:])
+        super().__init__(name, shape, first.dtype, dimensions, lambda e, rest: self.rows(np.array([e]))[0][rest])
 
     def rows(self, episodes: np.ndarray, rows: int | None = None) -> np.ndarray:
         """See `ComputedArray.rows`."""
