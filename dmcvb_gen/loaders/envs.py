@@ -249,21 +249,17 @@ class _Stage:
         Raises:
           DmcvbError: the actions have another shape, or are not finite numbers.
         """
-        clipped = np.clip(self._checked(actions, active), self.task.action_low, self.task.action_high)
-        result, self.action[active] = self.batch.step(clipped, active), clipped[active]
-        self.state = result.state
-        self.frame[active] += 1
-        truncated = active & (result.truncated | (self.frame >= self.max_steps)) & ~result.terminated
-        return result.reward, result.terminated, truncated
-
-    def _checked(self, actions: ArrayLike, active: np.ndarray) -> np.ndarray:
-        """(place, action) float64."""
         actions, wanted = np.asarray(actions, np.float64), (self.count, self.task.action_size)
         if actions.shape != wanted:
             raise DmcvbError(f"the actions have shape {actions.shape}; {self.task.id} takes shape {wanted}")
         if not np.isfinite(actions[active]).all():
             raise DmcvbError("the action holds NaN or infinite values; give finite numbers in action_space")
-        return actions
+        clipped = np.clip(actions, self.task.action_low, self.task.action_high)
+        result, self.action[active] = self.batch.step(clipped, active), clipped[active]
+        self.state = result.state
+        self.frame[active] += 1
+        truncated = active & (result.truncated | (self.frame >= self.max_steps)) & ~result.terminated
+        return result.reward, result.terminated, truncated
 
 
 def _pairs(task: Task, scene: Scene) -> list[tuple[tuple[int, int], tuple[int, int]]]:
