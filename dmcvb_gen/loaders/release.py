@@ -95,14 +95,12 @@ class SubsetReader(Subset):
         if kind not in kinds:
             raise UnknownNameError("kind of data set", kind, kinds)
         made, takes = kinds[kind]
-        known = [name for name in inspect.signature(takes).parameters if name not in ("subset", "worker", "workers")]
-        if kind == "transitions":
-            known.remove("next_step")
+        decided = {"next_step": True} if kind == "transitions" else {}
+        ours = {"subset", "worker", "workers", *decided}
+        known = [name for name in inspect.signature(takes).parameters if name not in ours]
         if unknown := options.keys() - {*known}:
             raise UnknownNameError(f"option of torch({kind!r})", min(unknown), known)
-        if kind == "transitions":
-            options["next_step"] = True
-        return made(self, **options)
+        return made(self, **options, **decided)
 
     def environment(self, **options: Any) -> Any:
         """The environment that matches the data: size, renderer, views, videos and time limit, with stacked frames.
