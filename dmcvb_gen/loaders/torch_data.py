@@ -125,9 +125,7 @@ class StreamDataset(_OfEpoch, IterableDataset):
         worker = get_worker_info()
         place: dict[str, Any] = dict(worker=worker.id, workers=worker.num_workers) if worker else {}
         items = stream(self.subset, epoch=max(0, given), **place, **self.options)
-        while True:
-            self._show(given)
-            values = next(items, None)
-            if values is None:
-                return
+        self._show(given)
+        for values in items:
             yield _tensors(values)
+            self._show(given)
