@@ -155,20 +155,19 @@ def check_replays(subset: Subset) -> Iterator[Issue]:
             message = f"ends after {length} steps, the same actions end it after {made.length[0]}"
             yield Issue("lengths", subset.name, message, episode)
             continue
-        rows, until = {"states": (made.state, "state"), "rewards": (made.reward, "reward")}, length + 1
-        rows = {"physics": (made.physics, "physics")} | rows
-        for check, (again, name) in rows.items():
+        until = length + 1
+        for check, name in (("physics", "physics"), ("states", "state"), ("rewards", "reward")):
             stored = values[name][:until]
-            gaps = np.abs(again[0, : len(stored)] - stored) / (1 + np.abs(stored))
+            gaps = np.abs(getattr(made, name)[0, : len(stored)] - stored) / (1 + np.abs(stored))
             gaps = gaps.reshape(len(stored), -1).max(axis=1)
-            wrong = np.flatnonzero(~(gaps <= STATE_TOLERANCE))
-            if not len(wrong):
+            wrong = ~(gaps <= STATE_TOLERANCE)
+            if not wrong.any():
                 continue
-            step = int(wrong[0])
+            step = int(wrong.argmax())
             if step and gaps[step - 1] > STATE_TOLERANCE / SUDDEN:
                 until = step
-                continue
-            yield Issue(check, subset.name, f"{name} is {gaps[step]:.3g} away from dm_control's", episode, step)
+            else:
+                yield Issue(check, subset.name, f"{name} is {gaps[step]:.3g} away from dm_control's", episode, step)
 
 
 def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Issue]:
