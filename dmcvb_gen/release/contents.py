@@ -6,6 +6,7 @@ sample of frames painted again.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator, Mapping
 
@@ -179,8 +180,7 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Iss
         message = f"backgrounds {source!r} are not those of the manifest; give --backgrounds"
         yield Issue("pixels", subset.name, message)
         return
-    renderer, _ = renderer_for(subset.record, source)
-    try:
+    with contextlib.closing(renderer_for(subset.record, source)[0]) as renderer:
         painted_here = np.flatnonzero(~subset.unpainted[subset.episodes])
         for episode, length in _sampled(subset, painted_here):
             values = subset.episode(episode, ["physics", *subset.pixel_arrays, *stored_in(subset.arrays)])
@@ -199,8 +199,6 @@ def check_pixels(subset: Subset, backgrounds: str | None = None) -> Iterator[Iss
                     yield Issue("pixels", subset.name, f"{name} is black", episode)
                 elif np.ptp(stored, axis=0).max() == 0 < np.ptp(painted, axis=0).max():  # some stand still
                     yield Issue("pixels", subset.name, f"{name} never changes", episode)
-    finally:
-        renderer.close()
 
 
 def _check_modalities(

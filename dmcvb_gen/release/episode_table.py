@@ -6,6 +6,7 @@ The viewer of the Hugging Face Hub shows it, and `datasets.load_dataset` reads i
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 from pathlib import Path
@@ -106,12 +107,10 @@ def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
     for episode in np.setdiff1d(episodes, lacking).tolist():
         frames[episode] = subset.array(name)[episode, 0]
     if len(lacking) and not subset.record.imported:
-        renderer, _ = renderer_for(subset.record, background_source(subset.release.path, subset.record))
-        try:
+        source = background_source(subset.release.path, subset.record)
+        with contextlib.closing(renderer_for(subset.record, source)[0]) as renderer:
             physics, labels = subset.read("physics", lacking)[:, 0], subset.labels(lacking)[:, 0]
             made = renderer.render(physics, labels, views=[pictures.views[0]], hide_goal=pictures.hide_goal)[:, 0]
-        finally:
-            renderer.close()
         frames |= dict(zip(lacking.tolist(), made, strict=True))
     return {"first_frame": [_picture(frame) for frame in frames.values()]}
 
