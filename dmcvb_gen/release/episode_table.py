@@ -7,7 +7,6 @@ The viewer of the Hugging Face Hub shows it, and `datasets.load_dataset` reads i
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
+from dmcvb_gen.release.export.episodes import png
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -118,8 +118,6 @@ def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
 def _picture(frame: np.ndarray | None) -> dict[str, Any] | None:
     if frame is None:
         return None
-    picture, buffer = Image.fromarray(frame), io.BytesIO()
-    if max(picture.size) > FRAME:
-        picture = picture.resize((FRAME, FRAME), Image.Resampling.BOX)
-    picture.save(buffer, "PNG")
-    return {"bytes": buffer.getvalue(), "path": None}
+    if max(frame.shape[:2]) > FRAME:
+        frame = np.asarray(Image.fromarray(frame).resize((FRAME, FRAME), Image.Resampling.BOX))
+    return {"bytes": png(frame), "path": None}
