@@ -178,18 +178,17 @@ class _Layout:
 
         fields: list[pa.Field] = []
         huggingface: dict[str, Any] = {}
-        told: dict[str, Any]
         for name, feature in self.features.items():
             if feature["dtype"] == "image":
-                kind, told = pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
+                kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+                huggingface[name] = {"_type": "Image"}
             else:
                 kind = {"float32": pa.float32(), "bool": pa.bool_(), "int64": pa.int64()}[feature["dtype"]]
-                told = {"dtype": feature["dtype"], "_type": "Value"}
-                if feature["shape"][0] > 1:  # LeRobot takes a single number for a scalar
-                    kind = pa.list_(kind, feature["shape"][0])
-                    told = {"feature": told, "length": feature["shape"][0], "_type": "List"}
+                huggingface[name] = {"dtype": feature["dtype"], "_type": "Value"}
+                if (length := feature["shape"][0]) > 1:  # LeRobot takes a single number for a scalar
+                    kind = pa.list_(kind, length)
+                    huggingface[name] = {"feature": huggingface[name], "length": length, "_type": "List"}
             fields.append(pa.field(name, kind))
-            huggingface[name] = told
         return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": huggingface}})})
 
 
@@ -248,7 +247,7 @@ class _Statistics:
         flat: dict[str, list] = {}
         shape: tuple[int, ...]
         for name, value in columns.items():
-            count = len(value)
+            count = np.array([len(value)])
             if value.dtype == np.uint16:
                 value, shape = value.reshape(-1, 1).astype(np.float64), (1, 1, 1)
             elif value.ndim == 4:
@@ -259,7 +258,7 @@ class _Statistics:
             part = {key: getattr(value, key)(axis=0).reshape(shape) for key in ("min", "max", "mean", "std")}
             found = np.quantile(value, list(QUANTILES.values()), axis=0)
             part |= {key: number.reshape(shape) for key, number in zip(QUANTILES, found, strict=True)}
-            part["count"] = np.array([count])
+            part["count"] = count
             self._parts.setdefault(name, []).append(part)
             flat |= {f"stats/{name}/{key}": number.tolist() for key, number in part.items()}
         return flat
