@@ -40,7 +40,6 @@ def write(source: Source, folder: Path) -> None:
     from dmcvb_gen.generate.references import reference_returns
 
     subset, size = source.subset, source.subset.record.size
-    name = folder_name(subset.name)
     picture = spaces.Box(0, 255, (size, size, 3 * len(source.views)), np.uint8)
     state = spaces.Box(-np.inf, np.inf, (subset.array("state").shape[-1],), np.float32)
     shape, bounds = subset.array("action").shape[-1:], subset.spec("action").attributes
@@ -55,7 +54,7 @@ def write(source: Source, folder: Path) -> None:
     )
     algorithms = sorted({str(policy.header.get("algorithm", subset.level)) for policy in subset.record.policies})
     facts = {
-        "dataset_id": name,
+        "dataset_id": folder_name(subset.name),
         "minari_version": minari.__version__,
         "algorithm_name": ", ".join(algorithms) or subset.level,
         "author": set(source.manifest.authors),
@@ -89,9 +88,8 @@ def _environment(source: Source, split: str) -> EnvSpec:
     from dmcvb_gen.loaders.matching import environment_options
 
     record = source.subset.record
-    setting = record.setting.partition("_")[0]
     options = environment_options(source.subset, split)
-    name = environment_id(record.name.split("/")[0], setting)
+    name = environment_id(record.name.split("/")[0], record.setting.partition("_")[0])
     registered = gymnasium.registry.get(name)
     spec = EnvSpec(name, entry_point=registered.entry_point if registered else ENTRY_POINT, kwargs=options)
     spec.order_enforce, spec.disable_env_checker = True, True
