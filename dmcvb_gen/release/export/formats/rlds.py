@@ -99,11 +99,8 @@ def _features(source: Source) -> dict[str, Any]:
     step = {
         "observation": _dict(observation),
         "action": _tensor("float32", subset.array("action").shape[-1]),
-        "reward": _tensor("float32"),
-        "discount": _tensor("float32"),
-        "is_first": _tensor("bool"),
-        "is_last": _tensor("bool"),
-        "is_terminal": _tensor("bool"),
+        **dict.fromkeys(("reward", "discount"), _tensor("float32")),
+        **dict.fromkeys(("is_first", "is_last", "is_terminal"), _tensor("bool")),
     }
     steps = {
         "pythonClassName": f"{_FEATURES}.dataset_feature.Dataset",
