@@ -110,7 +110,7 @@ def croissant(
         files=list(_files(release, table)),
         folders=[f"{group}/**" for group in groups(release)],
         fields=FIELDS,
-        rows=_rows(release, facts),
+        rows=list(_rows(release, facts)),
         columns={name: (TYPES.get(kind, "sc:Integer"), text) for name, (kind, text) in COLUMNS.items()},
         table=TABLE,
     )
@@ -138,12 +138,10 @@ def _files(release: Release, table: Path) -> Iterator[dict[str, Any]]:
         yield dict(path=path, kind=kind, text=text, bytes=len(data), sha256=sha256_bytes(data))
 
 
-def _rows(release: Release, facts: dict[str, Any]) -> list[dict[str, Any]]:
+def _rows(release: Release, facts: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The table of subsets."""
-    rows = []
     for subset in facts["subsets"]:
         record = release[subset["name"]].record
         row = subset | {"task": record.task, "level": record.level, "setting": record.setting}
         row |= {f"return_{key}": subset["returns"][key] for key in ("mean", "std")}
-        rows.append({f"subsets/{key}": row[key] for key in FIELDS})
-    return rows
+        yield {f"subsets/{key}": row[key] for key in FIELDS}
