@@ -4,7 +4,7 @@ Inputs and recipes come first, then each shard with its record last, the lists, 
 sizes alone are compared, so nothing is read twice. A part of a release is a copy: copy.json says of what.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,7 +99,7 @@ def _fetch(
     if not shards:
         raise StoreError(f"{source.place} has none of these episodes; it has others, see `dmcvb-gen info`")
     layers = {name for record in source.manifest.subsets if record.name in names for name in record.layers}
-    kept = _kept(source, target)
+    kept = list(_kept(source, target))
     first, last = described_files(source, names), list_files(source, layers | {shard.layer.name for shard in kept})
     files = [*first, *(file for shard in shards for file in (*shard.files, shard.record_file)), *last]
     download.begin(files)
@@ -113,16 +113,14 @@ def _fetch(
     return Moved(len(files), sum(file.bytes for file in files), download.moved)
 
 
-def _kept(source: Release, target: Store) -> list[Shard]:
+def _kept(source: Release, target: Store) -> Iterator[Shard]:
     """The shards of a release that a folder has already; after a growth they are read by the lists of the new one."""
-    found: list[Shard] = []
     for layer in source.manifest.layers:
         if numbers := recorded_shards(target, layer.name):
             shards = source.layer_shards(layer.name)
             if not shards and isinstance(layer, ListedLayer) and target.size(list_path(layer.list)) is None:
                 source.records(layer.name)  # says what the source lacks
-            found += [shard for shard in shards if shard.number in numbers]
-    return found
+            yield from (shard for shard in shards if shard.number in numbers)
 
 
 class _Download:
