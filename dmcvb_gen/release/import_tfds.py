@@ -109,8 +109,8 @@ def import_tfds(
     if not partial:
         for path in found:
             _refuse_missing(path)
-    sources = _sources(found, task, level, setting)
-    store, layers = open_store(target), [_layers(source) for source in sources]
+    sources = list(_sources(found, task, level, setting))
+    store, layers = open_store(target), [[*_layers(source)] for source in sources]
     records = [
         source.record.model_copy(update={"layers": tuple(layer.name for layer in own)})
         for source, own in zip(sources, layers, strict=True)
@@ -133,7 +133,7 @@ def import_tfds(
     return finish(store)
 
 
-def _layers(source: _Source) -> list[Layer]:
+def _layers(source: _Source) -> Iterator[Layer]:
     """The layers of an imported subset: trajectories, then the images of each view, with the goal or without it."""
     record, facts = source.record, source.facts
     rows, per_shard = record.max_steps + 1, shard_size(record.episodes, DEFAULT_EPISODES_PER_SHARD[record.family])
@@ -141,21 +141,19 @@ def _layers(source: _Source) -> list[Layer]:
     arrays = tuple(spec for spec in trajectory_arrays(get_task(record.task)) if spec.name != "physics")
     group = f"{record.name}.zarr"
     simulated: dict[str, Any] = given | {"kind": "trajectories", "arrays": arrays}
-    layers = [Layer(name=f"{record.name}/trajectories", group=f"{group}/trajectories", **simulated)]
+    yield Layer(name=f"{record.name}/trajectories", group=f"{group}/trajectories", **simulated)
     for name in picture_arrays(record.views, record.hidden_goal):
         spec = image_array(name, record.size, record.spec.camera_moves, rows)
         place = f"{record.name}/{spec.stored_name}"
-        layers.append(Layer(name=place, group=f"{group}/{record.setting}", kind="images", arrays=(spec,), **given))
-    return layers
+        yield Layer(name=place, group=f"{group}/{record.setting}", kind="images", arrays=(spec,), **given)
 
 
-def _sources(found: list[Path], task, level, setting) -> list[_Source]:
+def _sources(found: list[Path], task, level, setting) -> Iterator[_Source]:
     """The subsets that folders hold; the folders of a maze's fixed goals, one a goal, are one subset."""
     grouped: dict[str, list[tuple[Path, tuple[str, str, str, int | None]]]] = {}
     for path in found:
         facts = _identify(path, task, level, setting)
         grouped.setdefault(subset_name(*facts[:3]), []).append((path, facts))
-    sources = []
     for name, members in grouped.items():
         fixed = members[0][1][2] == FIXED
         if len(members) > 1 and not fixed:
@@ -164,8 +162,7 @@ def _sources(found: list[Path], task, level, setting) -> list[_Source]:
         folders = tuple(path for path, _ in members)
         files = [(goal, file) for goal, path in enumerate(folders) for file in _files(path)]
         places = tuple(Place(goal, file, *place) for goal, file in files for place in offsets(file))
-        sources.append(_Source(_record(name, members[0][1][:3], folders, places), folders, places))
-    return sources
+        yield _Source(_record(name, members[0][1][:3], folders, places), folders, places)
 
 
 def _identify(path: Path, task, level, setting) -> tuple[str, str, str, int | None]:
@@ -327,8 +324,7 @@ def _import_episode(source: _Source, place: Place, arrays: dict[str, np.ndarray]
         raise StoreError(f"an episode of {place.file} is not one of {task.id}: {error}; fetch the file again") from None
     arrays["length"][0], arrays["terminated"][0] = length, terminated
     arrays["return"][0], arrays["behaviour"][0] = arrays["reward"][0].astype(np.float64).sum(), -1
-    fixed = record.setting == FIXED
-    arrays["goal_pair"][0] = _goal_pair(place, values, len(source.folders)) if fixed else -1
+    arrays["goal_pair"][0] = _goal_pair(place, values, len(source.folders)) if record.setting == FIXED else -1
 
 
 def _picture(data: bytes, size: int) -> np.ndarray:
