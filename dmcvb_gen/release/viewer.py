@@ -5,7 +5,6 @@ that the release does not store are painted while the file is written.
 """
 
 import base64
-import hashlib
 import io
 import json
 import math
@@ -22,7 +21,7 @@ from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES
 from dmcvb_gen.errors import StoreError
-from dmcvb_gen.files import write_bytes
+from dmcvb_gen.files import sha256_bytes, write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import SubsetReader, open_for_reading
 from dmcvb_gen.options import Count, Local, Location, Names, checked, progress_bar
@@ -174,7 +173,7 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
         "seed": str(int(values["seed"])),
         "terminated": bool(values["terminated"]),
         "seconds": subset.record.seconds_per_step,
-        "trajectory": hashlib.sha256(values["state"].tobytes() + values["action"].tobytes()).hexdigest()[:16],
+        "trajectory": sha256_bytes(values["state"].tobytes() + values["action"].tobytes())[:16],
         "command": command,
         "shard": [span.start, min(span.stop, subset.record.episodes)],
         "frames": {view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
