@@ -88,8 +88,7 @@ class Agent:
 
     def foreign_code(self) -> dict[str, str]:
         """Part -> SHA-256 of its module's file, of parts from other packages: one that changed is trained again."""
-        parts = (part for part in (self.policy, self.pretrain) if part)
-        modules = {part: PARTS.get(part).__module__ for part in parts}
+        modules = {part: PARTS.get(part).__module__ for part in (self.policy, self.pretrain) if part}
         return {part: source_digest(module) for part, module in modules.items() if not module.startswith("dmcvb_gen.")}
 
 
@@ -108,9 +107,8 @@ def parse_agent(name: str) -> Agent:
     else:
         pretrain, _, policy = base.rpartition("+")
         agent = Agent(policy, pretrain or None)
-    parts = [part for part in (agent.pretrain, agent.policy) if part]
     defaults = {} if agent.sees_state else {"frames": FRAMES}
-    for part in parts:
+    for part in filter(None, (agent.pretrain, agent.policy)):
         defaults |= PARTS.get(part).options
     values: dict[str, int | bool] = {}
     for option in filter(None, options.split(":")):
