@@ -102,8 +102,8 @@ class FrameTable:
         if self._file is not None:
             _advise(self._file, "RANDOM", 0, frames.nbytes)  # what stands beside a stack is not read with it
         _, self.channels, self.size, _ = frames.shape
-        mirror = np.pad(np.arange(self.size), PAD, mode="symmetric")  # which pixel stands where, after padding
-        self._mirror = torch.from_numpy(mirror).to(self.table.device)
+        # Which pixel stands where, after padding.
+        self._mirror = torch.from_numpy(np.pad(np.arange(self.size), PAD, mode="symmetric")).to(self.table.device)
 
     def shifted(self, rows: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
         """(batch, frames) rows, (2, batch) offsets -> (batch, frames x channels, size, size) uint8."""
@@ -193,11 +193,10 @@ class TrainingData:
         returns: np.ndarray | None = None,
         device: str | torch.device = "cpu",
     ):
-        out = np.repeat(held_out, table.lengths + 1)
         values = (getattr(table, name) for name in (*FIELDS, "start", "end", "steps"))
         state, *values, self.start, self.end, rows = (torch.from_numpy(value).to(device) for value in values)
         self.action, self.reward, self.discount = (value.float() for value in values)
-        held = torch.from_numpy(out).to(device)
+        held = torch.from_numpy(np.repeat(held_out, table.lengths + 1)).to(device)
         self.train_rows, self.hold_out_rows = rows[~held[rows]], rows[held[rows]]
         self.normalization = Normalization.of(state[~held])
         self.state = self.normalization(state.float())
@@ -276,8 +275,7 @@ class TrainingData:
         if shift and not hold_out and self.frames is not None and self.latent is None:
             offsets = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
         if next_observation:
-            drawn = generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k)
-            steps = self._to_device(drawn)
+            steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
         return self.transitions(rows[self._to_device(index)], steps, offsets, later=later, **options)
 
     def transitions(
