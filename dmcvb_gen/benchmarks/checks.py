@@ -80,13 +80,9 @@ def check_policy_returns(subset: Subset) -> Iterator[Issue]:
         tolerance += 0.01 * abs(said["mean"])
         if not abs(returns.mean() - said["mean"]) <= tolerance:
             worst = int(np.abs(returns - said["mean"]).argmax())
-            yield Issue(
-                "returns",
-                subset.name,
-                f"mean return of policy {policy.name} is {returns.mean():.1f}, its file says {said['mean']:.1f} "
-                f"(more than {tolerance:.1f} apart)",
-                int(subset.episodes[behaviour == index][worst]),
-            )
+            told = f"mean return of policy {policy.name} is {returns.mean():.1f}, its file says {said['mean']:.1f}"
+            told += f" (more than {tolerance:.1f} apart)"
+            yield Issue("returns", subset.name, told, int(subset.episodes[behaviour == index][worst]))
 
 
 def comparable(subset: Subset) -> bool:
