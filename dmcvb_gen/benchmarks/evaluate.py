@@ -246,17 +246,15 @@ class Evaluator:
             if not active.any():
                 break
         success, speed = goal_scores(task, start, length, ended)
-        return Score.of(
-            returns, success=success, speed=speed, limit=self.steps, pictures=np.stack(pictures) if pictures else None
-        )
+        shown = np.stack(pictures) if pictures else None
+        return Score.of(returns, success=success, speed=speed, limit=self.steps, pictures=shown)
 
     def _walk(self) -> DistractorSampler | None:
         """The distractors of the episodes; None for policies that see states."""
         if self.renderer is None:
             return None
         generators = {name: self.streams(name) for name in DISTRACTOR_STREAMS}
-        frames, split = self.steps + 1, self.scene.split
-        return DistractorSampler(self.task, self.setting, frames, generators, self.videos, split=split)
+        return DistractorSampler(self.task, self.setting, self.steps + 1, generators, self.videos, self.scene.split)
 
     def _see(self, stack, physics, walk: DistractorSampler, step: int, active, action=None) -> np.ndarray:
         """(episode, frame, channel, size, size) uint8 with the newest frame last; only running episodes are painted."""
