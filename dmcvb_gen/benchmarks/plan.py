@@ -204,9 +204,8 @@ class SubsetFinder:
 
     def settings(self, task: str) -> list[str]:
         """Settings of a task: those there are, in the paper's order, other difficulties last."""
-        have = dict.fromkeys(setting for t, _, setting in self._names if t == task)
-        order = {setting: index for index, setting in enumerate(spec.DISTRACTOR_KINDS)}
-        return sorted(have, key=lambda s: (order.get(s, len(order)), s))
+        have = {setting for t, _, setting in self._names if t == task}
+        return [*(kind for kind in spec.DISTRACTOR_KINDS if kind in have), *sorted(have - {*spec.DISTRACTOR_KINDS})]
 
     def levels(self, task: str, setting: str) -> list[str]:
         """Levels that there are of a task and setting, best first."""
