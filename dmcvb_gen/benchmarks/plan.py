@@ -353,8 +353,8 @@ def plan_benchmark(name: str, release: Release, agents: Sequence[str] = ()) -> t
     chosen = [parse_agent(agent) for agent in agents or benchmark.agents]
     if benchmark.compares_encoders:
         chosen = [agent for agent in chosen if agent.pretrain]
-    cells = list(dict.fromkeys(benchmark.cells(data, chosen)))
-    cells = [replace(cell, pretrain=()) if cell.agent.sees_by_dino else cell for cell in cells]  # it learns elsewhere
+    # An encoder of DINO learned elsewhere.
+    cells = [replace(cell, pretrain=()) if cell.agent.sees_by_dino else cell for cell in benchmark.cells(data, chosen)]
     for encoder in [cell.encoder for cell in cells if cell.encoder]:
         images, labels = ({part.subset for part in parts} for parts in (encoder.policy, encoder.pretrain))
         if not labels <= images:
