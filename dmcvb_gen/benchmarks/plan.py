@@ -471,20 +471,18 @@ class LabelBudgets(Benchmark):
 
     def cells(self, data, agents):
         bc = parse_agent("bc")
-        places = (
-            (task, s) for task in data.tasks for s in ([spec.VISIBLE] if spec.is_maze(task) else data.settings(task))
-        )
-        for task, setting in places:
-            whole = data.parts(task, ["expert"], setting)
-            if not whole:
-                continue
-            yield Cell(self.name, task, setting, bc, whole)  # scores are shares of this one
-            there = len(data.release[whole[0].subset].episodes)
-            for budget in [budget for budget in self.budgets if budget < there - math.ceil(HOLD_OUT * there)]:
-                labeled = (replace(whole[0], episodes=budget),)
-                yield Cell(self.name, task, setting, bc, labeled)
-                for agent in agents:
-                    yield Cell(self.name, task, setting, agent, labeled, whole)
+        for task in data.tasks:
+            for setting in [spec.VISIBLE] if spec.is_maze(task) else data.settings(task):
+                whole = data.parts(task, ["expert"], setting)
+                if not whole:
+                    continue
+                yield Cell(self.name, task, setting, bc, whole)  # scores are shares of this one
+                there = len(data.release[whole[0].subset].episodes)
+                for budget in [budget for budget in self.budgets if budget < there - math.ceil(HOLD_OUT * there)]:
+                    labeled = (replace(whole[0], episodes=budget),)
+                    yield Cell(self.name, task, setting, bc, labeled)
+                    for agent in agents:
+                        yield Cell(self.name, task, setting, agent, labeled, whole)
 
     def reference(self, cell):
         return "BC on all labels"
