@@ -316,9 +316,9 @@ def render_page(facts: dict[str, Any], good: Results, folder: Path) -> str:
     return jinja.get_template("report.html.jinja").render(
         facts | _tables(facts),
         curves=[figure_url(figure) for figure in curve_figures(good, name)],
-        rollouts=_sheets(good, folder, "rollout"),
-        decoders=_sheets(good, folder, "decoder"),
-        inspection=_inspection(good),
+        rollouts=list(_sheets(good, folder, "rollout")),
+        decoders=list(_sheets(good, folder, "decoder")),
+        inspection=list(_inspection(good)),
         times=[(result["id"], f"{result['seconds']:.0f}") for result in facts["results"]],
         settings=list(((facts["budget"] if facts["cells_planned"] else {}) | facts["versions"]).items()),
     )
@@ -487,19 +487,16 @@ def _notes(facts: Mapping[str, Any]) -> list[str]:
     return notes
 
 
-def _inspection(good: Results) -> list[tuple[str, ...]]:
+def _inspection(good: Results) -> Iterator[tuple[str, ...]]:
     """A row an encoder; none for those of data of which nothing is held out."""
-    rows = []
     for cell, result in good:
         found = result["inspection"]
         if found and found["state_mse"] is not None:
-            rows.append((cell.label, cell.place, *(f"{found[key]:.4f}" for key in ("observation_mse", "state_mse"))))
-    return rows
+            yield cell.label, cell.place, *(f"{found[key]:.4f}" for key in ("observation_mse", "state_mse"))
 
 
-def _sheets(good: Results, folder: Path, kind: str) -> list[dict[str, str]]:
+def _sheets(good: Results, folder: Path, kind: str) -> Iterator[dict[str, str]]:
     """Pictures that cells left: "rollout" or "decoder"."""
-    found = []
     for cell, result in good:
         path = folder / "cells" / f"{cell.id}.{kind}.png"
         if not path.exists():
@@ -509,8 +506,7 @@ def _sheets(good: Results, folder: Path, kind: str) -> list[dict[str, str]]:
             returns = result["final"]["returns"]
             caption += f": first of {len(returns)} episodes of the last evaluation, return {_number(returns[0])} "
             caption += f"[{result['budget']['name']}]"
-        found.append({"caption": caption, "source": data_url(path.read_bytes())})
-    return found
+        yield {"caption": caption, "source": data_url(path.read_bytes())}
 
 
 # -- figures ----------------------------------------------------------------------------------------
@@ -556,5 +552,4 @@ def _draw_curve(loss, score, label: str, color: str, curve: list[dict[str, Any]]
         if points:
             loss.plot(*zip(*points, strict=True), style, color=color, linewidth=1)
     points = [(p["step"], p["score"]["mean"], p["score"]["stderr"]) for p in curve if "score" in p]
-    steps, means, errors = zip(*points, strict=True)
-    score.errorbar(steps, means, errors, marker="o", markersize=3, color=color, label=label)
+    score.errorbar(*zip(*points, strict=True), marker="o", markersize=3, color=color, label=label)
