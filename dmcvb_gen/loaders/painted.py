@@ -41,13 +41,8 @@ DRAWN_KEPT = 4 * DRAWN_TOGETHER
 """Episodes of which a subset keeps what they are painted from."""
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """What an episode's frames are painted from: (row, ...) states and labels, and its transitions."""
-
-    physics: np.ndarray
-    length: int
-    labels: DistractorState
+Drawn = tuple[np.ndarray, DistractorState]
+"""(row, ...) physics states and labels that an episode's frames are painted from, to its end."""
 
 
 @dataclass(frozen=True)
@@ -154,10 +149,10 @@ class PaintedSubset(SubsetReader):
     def _shown_label(self, episode: int, spec: ArraySpec) -> np.ndarray:
         """Values of a fresh label, rows past the episode's end zero."""
         self._check_episode(episode)
-        rows = int(self.read("length", [episode])[0]) + 1
         values = np.zeros((self.record.max_steps + 1, *spec.shape), spec.dtype)
         with self._lock:
-            values[:rows] = getattr(self._drawn_of(episode).labels, spec.name.removeprefix("exogenous/"))[:rows]
+            _, labels = self._drawn_of(episode)
+        values[: len(labels)] = getattr(labels, spec.name.removeprefix("exogenous/"))
         return values
 
     def prepare(self, episodes: np.ndarray, pictures: Iterable[str]) -> None:
@@ -206,10 +201,9 @@ class PaintedSubset(SubsetReader):
 
     def _paint(self, episode: int, arrays: list[str]) -> dict[str, np.ndarray]:
         renderer, _ = self._painter
-        drawn = self._drawn_of(episode)
-        length, rows = np.array([drawn.length]), self.record.max_steps + 1
-        physics, labels = drawn.physics[None, : drawn.length + 1], drawn.labels[None, : drawn.length + 1]
-        pictures = paint(get_task(self.task), renderer, physics, labels, length, rows, arrays=arrays)
+        physics, labels = self._drawn_of(episode)
+        length, rows = np.array([len(physics) - 1]), self.record.max_steps + 1
+        pictures = paint(get_task(self.task), renderer, physics[None], labels[None], length, rows, arrays=arrays)
         return {name: value[0] for name, value in pictures}
 
     @functools.cached_property
@@ -232,8 +226,8 @@ class PaintedSubset(SubsetReader):
             physics, length = self.read("physics", new), self.read("length", new)
             labels = self._fresh_labels(new, physics, length) if self.fresh else self.labels(new)
             self._drawn |= {
-                (episode, self.epoch): Drawn(physics[place], int(length[place]), labels[place])
-                for place, episode in enumerate(new)
+                (episode, self.epoch): (physics[place, :rows], labels[place, :rows])
+                for place, (episode, rows) in enumerate(zip(new, length + 1, strict=True))
             }
         for episode in episodes:
             self._drawn.move_to_end((episode, self.epoch))
