@@ -11,7 +11,7 @@ import functools
 import re
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import ArraySpec, SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_of
+from dmcvb_gen.dataset.schema import image_array
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs, whose_videos
@@ -121,25 +122,21 @@ class PaintedSubset(SubsetReader):
           StoreError: it was computed for other images than these.
         """
         if picture_of(name) is not None:
-            record, axes = self.record, ("episode", "step", "height", "width", "channel")
-            shape = (record.episodes, record.max_steps + 1, record.size, record.size, 3)
-            return ComputedArray(
-                name, shape, np.dtype(np.uint8), axes, lambda e, rest: self.painted(e, [name])[name][rest]
-            )
+            spec = image_array(name, self.record.size, camera_moves=False, rows=self.record.max_steps + 1)
+            return self._computed(spec, lambda e, rest: self.painted(e, [name])[name][rest])
         if self._other_frames and stored_in([name]):
             raise StoreError(
                 f"the stored {name} of {self.name} belongs to the images as they were made, not to those with "
                 "distractors='resample' or another size; open the release without these to read it"
             )
-        if (spec := self._fresh_specs.get(name)) is None:
+        if name not in self._fresh_specs:
             return super().array(name)
-        return ComputedArray(
-            name,
-            (self.record.episodes, self.record.max_steps + 1, *spec.shape),
-            np.dtype(spec.dtype),
-            ("episode", "step", *spec.dims),
-            lambda e, rest: self._shown_label(e, spec)[rest],
-        )
+        spec = self._fresh_specs[name]
+        return self._computed(spec, lambda e, rest: self._shown_label(e, spec)[rest])
+
+    def _computed(self, spec: ArraySpec, compute: Callable[[int, tuple], np.ndarray]) -> ComputedArray:
+        shape = (self.record.episodes, self.record.max_steps + 1, *spec.shape)
+        return ComputedArray(spec.name, shape, np.dtype(spec.dtype), ("episode", "step", *spec.dims), compute)
 
     @functools.cached_property
     def _fresh_specs(self) -> dict[str, ArraySpec]:
