@@ -455,7 +455,8 @@ def test_a_plain_network_says_neither_activation_nor_actions(plain, tmp_path):
 
 
 def test_a_policy_without_noise_is_not_sampled(plain, tmp_path):
-    run(*plain, "--actions", "clip", "--out", tmp_path / "clip.safetensors")
+    plain[plain.index("--actions") + 1] = "clip"
+    run(*plain, "--out", tmp_path / "clip.safetensors")
     for name, *command in (("p", "rollout", "--out", tmp_path / "r"), ("clip", "evaluate-behaviour")):
         words = ["--sample", "--behaviour", tmp_path / f"{name}.safetensors"]
         assert "has no noise to sample; remove it" in refused(*command, WALKER, *words)
