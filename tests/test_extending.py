@@ -42,6 +42,10 @@ def test_a_distractor_of_your_own_paints_a_release_that_verifies(tmp_path, monke
     monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", "")
     run("card", tmp_path / "r", "--check")
     run("view", tmp_path / "r", "--out", tmp_path / "page.html")
+    with monkeypatch.context() as context:
+        context.setenv("DMCVB_GEN_DISTRACTORS", f"{name}:Grey")
+        context.setattr("dmcvb_gen.generate.resolve.code_of_distractor", lambda setting: ["another"])
+        assert "grey_hard is not that which made these data" in str(verify(tmp_path / "r").unchecked[0])
     for gone, told in (("", "unknown distractor 'grey'"), ("gone_file:Grey", "cannot find distractor gone_file:Grey")):
         monkeypatch.setenv("DMCVB_GEN_DISTRACTORS", gone)
         output = invoke("verify", tmp_path / "r", code=3).output

@@ -303,14 +303,16 @@ def _check_subset(work: tuple[Subset, str | None], tick: ProgressCallback) -> li
     tick(subset.name)
     try:
         from dmcvb_gen.distractors.registry import distractors_of
-        from dmcvb_gen.generate.resolve import code_of_task
+        from dmcvb_gen.generate.resolve import code_of_distractor, code_of_task
         from dmcvb_gen.release import contents
         from dmcvb_gen.tasks import get_task
 
         get_task(subset.task)
         distractors_of(subset.record.distractor)
-        if subset.trajectories.makes.get("code", "") != code_of_task(subset.task):
-            raise DmcvbError(f"the code of {subset.task} is not that which made these data")
+        now = {"trajectories": code_of_task(subset.task), "labels": code_of_distractor(subset.record.distractor)}
+        own = [(layer.makes.get("code"), now[layer.kind]) for layer in subset.layers if layer.kind in now]
+        if any((made or None) != (here or None) for made, here in own):
+            raise DmcvbError(f"the code of your own behind {subset.name} is not that which made these data")
     except ModuleNotFoundError as error:
         # Fetch-only installs have no simulator; bytes are checked all the same, and this says what was not.
         lacks = f"values, physics and images were not checked: {error.name} is not installed"
