@@ -44,7 +44,7 @@ def _verified(path, result):
         yield f"... and {len(result.findings) - 50} more"
     yield from (f"NOT CHECKED {issue.subset}: {issue.message}" for issue in result.unchecked)
     named = {name: counts for name, counts in result.incomplete.items() if counts[0] or len(result.incomplete) <= 10}
-    yield from (f"{name}: {here:,} of {planned:,} episodes" for name, (here, planned) in named.items())
+    yield from (f"{name}: {here:,} of {planned:,} episodes are complete" for name, (here, planned) in named.items())
     if absent := len(result.incomplete) - len(named):
         yield f"{absent:,} of {pluralize(len(result.incomplete), 'incomplete subsets')} have no local episodes."
     checked = ", ".join(pluralize(count, name) for name, count in result.checked.items())
@@ -52,9 +52,7 @@ def _verified(path, result):
         checked += f" of {result.covered:,}"
     verdict = "All checks passed" if result.sound else pluralize(len(result.findings), "findings")
     if result.incomplete:
-        here = result.checked["episodes"]
-        planned = here + sum(planned - count for count, planned in result.incomplete.values())
-        verdict += f", incomplete: {here:,} of {planned:,} episodes"
+        verdict += f", incomplete: {pluralize(len(result.incomplete), 'subsets')}"
     elif result.sound and not result.finished:
         verdict += f", not finished: dmcvb-gen cluster finish {quoted(path)}"
     yield f"{path}: {verdict} ({checked})"

@@ -77,7 +77,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
         steps=sum(subset["steps"] for subset in subsets),
         bytes=sum(file.bytes for shard in release.shards() if shard.here for file in shard.files),
         subsets=subsets,
-        missing={name: planned for name, (here, planned) in release.unfinished.items() if not here},
+        missing={name: planned for name, (_, planned) in release.unfinished.items() if name not in release.subsets},
     )
 
 
