@@ -77,7 +77,8 @@ def print_table(
 
     if title:
         console.print(Text(printable(title), "bold"), soft_wrap=False)
-    put(heads, "bold")
+    if lines:
+        put(heads, "bold")
     for line in lines:
         put(line, "dim" if line[0].startswith(" ") else "")
     if hidden:

@@ -56,7 +56,7 @@ def info(path, storage_options, as_json, progress):
     click.echo(f"{facts['steps']:,} steps, {format_bytes(facts['bytes'])}")
     if facts["missing"]:
         count = len(facts["missing"])
-        click.echo(f"{count:,} of {pluralize(count + len(facts['subsets']), 'subsets')} have no local episodes.")
+        click.echo(f"no local episodes: {count:,} of {pluralize(count + len(facts['subsets']), 'subsets')}")
     for line in dict.fromkeys(line for subset in facts["subsets"] for line in _look_of(subset)):
         click.echo(line)
     policies = dict.fromkeys(name for subset in facts["subsets"] for name in subset["policies"])
