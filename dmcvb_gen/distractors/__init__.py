@@ -70,7 +70,8 @@ class DistractorSampler:
                 found.update(nominal.nominal(self._scene, physics))
             for distractor in self._drawn:
                 found.update(distractor.labels(physics, frames))
-            found = {name: np.array(values) for name, values in found.items()}  # `adjust` may write into them
+            if self.own:  # its `adjust` may write into them
+                found = {name: np.array(values) for name, values in found.items()}
             for distractor in self._drawn:
                 distractor.adjust(found, actions, frames)
             if self.own:

@@ -262,8 +262,8 @@ class EpisodeBatch(abc.ABC):
     """`size` episodes of one task, simulated together. A simulation never influences its neighbors.
 
     Attributes:
-      alone: False if other threads may run beside it: whether a user's task draws from global generators is not seen
-        then.
+      alone: False if other threads may draw random numbers meanwhile. Draws of a user's task from global generators
+        are not detected then.
     """
 
     alone = True

@@ -389,7 +389,7 @@ class _Episode:
         return np.concatenate([self.full_state(), *entries, self.terrain if self.task.draws_terrain else ()])
 
     def put(self, row: np.ndarray) -> None:
-        """Put the simulation into a stored row; what the task keeps in Python, and last observed, stays as it is."""
+        """Set the simulation to a stored row. The task's Python state and its last observation do not change."""
         physics, spec = self.environment.physics, self.task.physics_spec
         with self._told():
             self.task.apply_entries(self.model, row)
@@ -498,9 +498,9 @@ class EnvironmentBatch(EpisodeBatch):
         return np.array([self._running(sim).row() for sim in range(self.size)])
 
     def set_physics(self, physics, ids=None):
-        """See `EpisodeBatch`; what a task keeps in Python stays as it is, so it may go on in another way.
+        """See `EpisodeBatch`. A task's Python state does not change, so an episode may continue differently.
 
-        A user's own task observes again with its next step, as its environment's `step` gives it.
+        The returned states of a user's own task are those of its last step: it observes again in the next one.
         """
         ids = self._all if ids is None else np.asarray(ids, int)
         for sim, row in zip(ids.tolist(), np.asarray(physics, np.float64), strict=True):

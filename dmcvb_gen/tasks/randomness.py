@@ -65,7 +65,7 @@ def watched(complain: Callable[[str], Exception], alone: bool = True) -> Iterato
     """Raise what `complain` makes of a reason if code draws from a global generator, or makes one without a seed.
 
     Args:
-      alone: False if other threads may draw from the global generators meanwhile, which are not looked at then.
+      alone: False if other threads may draw from the global generators meanwhile. These are not compared then.
     """
 
     def refuse(count: int) -> int:
