@@ -171,7 +171,7 @@ def test_a_release_of_ones_own_task_is_verified_by_replay_and_not_checked_withou
 
     monkeypatch.setattr("arm_tasks.ends", lambda: arm(EndedByPython(), ARM.replace('size=".05"', 'size=".06"')))
     get_task.cache_clear()
-    assert "the code of arm_tasks:ends is not that which made these data" in str(verify(tmp_path / "r").unchecked[0])
+    assert f"behind {name} is not that which made these data" in str(verify(tmp_path / "r").unchecked[0])
 
     monkeypatch.delenv(ALLOWED)
     get_task.cache_clear()
