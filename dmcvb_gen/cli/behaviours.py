@@ -172,7 +172,8 @@ def convert_policy(as_json, progress, **options):
     """Convert another program's policy to a policy file: a Stable-Baselines3 zip or a torch state dict (CleanRL).
 
     Weights are read without unpickling anything. Data of a converted policy regenerate bit for bit. CleanRL's SAC keeps
-    its mean alone; CleanRL's PPO and SB3's VecNormalize need --statistics.
+    its mean alone; CleanRL's PPO and SB3's VecNormalize need --statistics. The zip of an off-policy algorithm does not
+    say whether VecNormalize stood before it.
 
     \b
     dmcvb-gen convert-policy model.zip walker-run --out walker-run.safetensors

@@ -37,7 +37,7 @@ class Facts:
       fields: name -> size of the parts of a Dict observation, in their order; None for a plain vector.
       activation: of hidden layers; None: the algorithm's default.
       steps: that it was trained for.
-      normalized: VecNormalize stood before it.
+      normalized: VecNormalize stood before it; the zips of off-policy algorithms do not say so.
       renorm_eps: added to the variances of a BatchRenorm.
     """
 
@@ -97,7 +97,7 @@ def facts_of(path: Path, data: Mapping[str, Any]) -> Facts:
         fields=_fields(path, data.get("observation_space") or {}),
         activation=activation,
         steps=steps if isinstance(steps, int) and steps >= 0 else 0,
-        normalized=data.get("_last_original_obs") is not None,
+        normalized="replay_buffer_class" not in data and data.get("_last_original_obs") is not None,
         renorm_eps=float(kwargs.get("batch_norm_eps", 0.001)),
     )
 

@@ -2,7 +2,8 @@
 
 Settings are the arguments of the algorithm's class. Policies are exported as everybody's zips are, by
 `policies.convert`. A run goes on from SB3's own parameters and its replay buffer, with new episodes; nothing is
-unpickled. Steps of an on-policy algorithm since its last update are not kept.
+unpickled. Steps of an on-policy algorithm since its last update are not kept. Observations and rewards are as they are:
+who wants VecNormalize trains with SB3 on an environment of this package and converts the zip.
 """
 
 from __future__ import annotations
@@ -22,10 +23,8 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.type_aliases import TrainFrequencyUnit
-from stable_baselines3.common.vec_env import VecNormalize
 
-from dmcvb_gen.errors import DmcvbError, PolicyFileError, UnknownNameError
+from dmcvb_gen.errors import DmcvbError, PolicyFileError, UnknownNameError, first_line
 from dmcvb_gen.policies.convert import UNCLIPPED, convert
 from dmcvb_gen.training.networks import as_tensors
 from dmcvb_gen.training.run import Run
@@ -37,7 +36,7 @@ ALGORITHMS = ("A2C", "CrossQ", "DDPG", "PPO", "SAC", "TD3", "TQC", "TRPO")
 NOT_SET = ("self", "policy", "env", "device", "verbose", "seed", "tensorboard_log", "_init_setup_model")
 NOT_SET += ("optimize_memory_usage",)
 """Arguments of an algorithm that the run gives, or that its saved buffer does not know."""
-OURS = {"simulations": 8, "normalize_observation": False, "normalize_reward": False}
+OURS = {"simulations": 8}
 KINDS: dict[Any, Any] = {bool: bool, int: Count, float: NonNegative, str: float | str}
 KINDS |= {"gradient_steps": Literal[-1] | Count, "learning_starts": Natural, "top_quantiles_to_drop_per_net": Natural}
 KINDS |= dict.fromkeys(("action_noise", "clip_range_vf", "target_kl"), NonNegative | None)
@@ -46,7 +45,6 @@ MEANINGS = """Settings of an algorithm of SB3.
 
 Attributes:
   simulations: episodes stepped side by side.
-  normalize_observation, normalize_reward: running normalization (VecNormalize).
 """
 BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -89,18 +87,7 @@ def check(run: Run) -> None:
     """
     if run.config.init_from:
         raise DmcvbError(f"--init-from has no effect with --algo {run.config.algorithm}: remove it")
-    model = make_model(run)
-    export(run, model)
-    simulations, starts = run.settings.simulations, getattr(model, "learning_starts", 0)
-    frequency = getattr(model, "train_freq", None)  # of an algorithm with a replay buffer
-    each = simulations * (model.n_steps if frequency is None else frequency.frequency)
-    each *= run.task.max_steps if frequency and frequency.unit is TrainFrequencyUnit.EPISODE else 1
-    first = each if frequency is None else starts // each * each + each
-    if run.config.steps <= first:  # SB3 learns after a step that is not the last one
-        raise DmcvbError(
-            f"{run.config.algorithm} learns from step {first:,} on, and {run.config.steps:,} are asked for; give more "
-            "--steps, or less n_steps, train_freq or learning_starts with --set"
-        )
+    export(run, make_model(run))
 
 
 def make_model(run: Run) -> BaseAlgorithm:
@@ -116,43 +103,31 @@ def make_model(run: Run) -> BaseAlgorithm:
     seed = run.config.seed
     if run.step:  # it goes on, with new episodes and new noise
         seed = int(np.random.default_rng([seed, run.step]).integers(2**31))
-    env: Any = TaskVecEnv(run.task, run.settings.simulations, seed)
-    if run.settings.normalize_observation or run.settings.normalize_reward:
-        norms = {"norm_obs": run.settings.normalize_observation, "norm_reward": run.settings.normalize_reward}
-        env = VecNormalize(env, **norms, gamma=given["gamma"])
+    env = TaskVecEnv(run.task, run.settings.simulations, seed)
     try:
         model = algorithm_class(run.config.algorithm)("MlpPolicy", env, seed=seed, device="cpu", **given)
     except Exception as error:  # SB3's, torch's and numpy's own kinds
-        reason = " ".join(str(error).split())
-        raise DmcvbError(f"{run.config.algorithm} does not accept this: {reason}; change it with --set") from None
+        raise DmcvbError(f"{run.config.algorithm} does not accept this: {first_line(error)}; see --set") from None
     model.set_logger(Logger(None, []))  # its own makes a folder in the system's temporary folder each time
     return model
 
 
 def export(run: Run, model: BaseAlgorithm) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Weights of the policy file, and the fields of its header that say how the actor is built."""
-    normalize, size = model.get_vec_normalize_env(), run.task.behaviour_size
-    mean, std = np.zeros(size), np.ones(size)
-    if normalize and normalize.norm_obs:
-        mean, std = normalize.obs_rms.mean, np.sqrt(normalize.obs_rms.var + normalize.epsilon)
     with tempfile.TemporaryDirectory() as folder:
-        np.savez(Path(folder, "seen.npz"), mean=mean, std=std)
         model.save(Path(folder, "model.zip"))
         try:
-            header, weights = convert(Path(folder, "model.zip"), run.task.id, statistics=Path(folder, "seen.npz"))
+            header, weights = convert(Path(folder, "model.zip"), run.task.id)
         except PolicyFileError as error:
             raise PolicyFileError(str(error).replace(f"{folder}/model.zip", run.config.algorithm)) from None
     built = {name: getattr(header, name) for name in ("hidden", "activation", "distribution")}
-    return as_tensors(weights), built | {"clip_observation": 10.0 if normalize and normalize.norm_obs else UNCLIPPED}
+    return as_tensors(weights), built | {"clip_observation": UNCLIPPED}
 
 
 def state_of(model: BaseAlgorithm) -> dict[str, Any]:
     """What a run goes on from."""
     variables = {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]}
     state: dict[str, Any] = {"parameters": model.get_parameters(), "variables": variables, "updates": model._n_updates}
-    if normalize := model.get_vec_normalize_env():
-        norms = {name: getattr(normalize, name) for name in ("obs_rms", "ret_rms") if hasattr(normalize, name)}
-        state["norms"] = {n: [torch.as_tensor(v) for v in (rms.mean, rms.var, rms.count)] for n, rms in norms.items()}
     if buffer := getattr(model, "replay_buffer", None):
         state["buffer"] = {name: torch.from_numpy(getattr(buffer, name)[: buffer.size()]) for name in BUFFER}
         state |= {"position": buffer.pos, "full": buffer.full}
@@ -164,9 +139,6 @@ def restore(model: BaseAlgorithm, saved: dict[str, Any]) -> None:
     model.set_parameters(saved["parameters"], device="cpu")
     for name, value in saved["variables"].items():
         getattr(model, name).data.copy_(value)
-    for name, moments in saved.get("norms", {}).items():
-        running = getattr(model.get_vec_normalize_env(), name)
-        running.mean, running.var, running.count = (value.numpy().copy() for value in moments)
     if "buffer" in saved:
         for name, value in saved["buffer"].items():
             getattr(model.replay_buffer, name)[: len(value)] = value.numpy()
@@ -195,4 +167,9 @@ def train(run: Run) -> None:
 
     if run.step < run.config.steps:
         model.learn(run.config.steps - run.step, after_step, log_interval=None, reset_num_timesteps=False)
+    if not model._n_updates:
+        raise DmcvbError(
+            f"{run.config.algorithm} learned nothing in {run.step:,} steps; give more --steps, or less n_steps, "
+            "train_freq or learning_starts with --set"
+        )
     run.save(state_of(model))
