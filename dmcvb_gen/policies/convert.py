@@ -140,31 +140,13 @@ def convert(
     facts = None if data is None else facts_of(path, data)
     state = _without_renorm(path, state, facts.renorm_eps if facts else 0.0)
     layout, body, mean = _layout(path, state)
-    if layout.algorithm == "sb3" and facts is None:
-        raise PolicyFileError(f"{path} does not say how the policy acts; give the .zip of Stable-Baselines3's save()")
-    if distribution is not None and layout.distribution is not None:
-        raise PolicyFileError(f"--actions has no effect: the actions of {path} are known; remove it")
-    known = (facts and facts.activation) or layout.activation
-    if facts and known and activation not in (None, known):
-        raise PolicyFileError(f"--activation has no effect: that of {path} is known, {known}; remove it")
-    activation = activation or known
-    distribution = layout.distribution or distribution
-    if activation is None or distribution is None:
-        raise PolicyFileError(
-            f"{path} does not say its activation and its actions; run `{command} --activation tanh --actions tanh` "
-            "with the ones that it has, and use the new file"
-        )
+    activation, distribution = _how_it_acts(path, layout, facts, activation, distribution, command)
     weights = _weights(path, task, state, body, mean, layout.log_std, distribution)
-    if distribution == "gaussian" and len(weights["mean.bias"]) == task.action_size:
-        _scaled(weights, task)
-    sizes = weights["body.0.weight" if body else "mean.weight"].shape[1], weights["mean.weight"].shape[0]
+    first = weights["body.0.weight" if body else "mean.weight"]
     widths = tuple(int(weights[f"body.{2 * index}.weight"].shape[0]) for index in range(len(body)))
-    if sizes != (task.behaviour_size, task.action_size):
-        layers, asked = (sizes[0], *widths, sizes[1]), (task.behaviour_size, *widths, task.action_size)
-        raise PolicyFileError(
-            f"{path} has layers of {' x '.join(map(str, layers))}, {task_id} asks for {' x '.join(map(str, asked))} "
-            "(observation, hidden, action); train it on this task"
-        )
+    _check_sizes(path, task, (first.shape[1], *widths, weights["mean.weight"].shape[0]))
+    if distribution == "gaussian":
+        _scaled(weights, task)
     if facts:
         _check_actions(path, task, facts.low, facts.high)
     wrapper = "VecNormalize" if facts and facts.normalized else NORMALIZED.get(layout.body)
@@ -180,8 +162,8 @@ def convert(
         header = PolicyHeader(
             task=task_id,
             observation=task.observation,
-            observation_size=sizes[0],
-            action_size=sizes[1],
+            observation_size=task.behaviour_size,
+            action_size=task.action_size,
             algorithm=layout.algorithm,
             agent_step=facts.steps if facts else 0,
             level=level,
@@ -274,6 +256,36 @@ def _layout(path: Path, state: Mapping[str, np.ndarray]) -> tuple[Layout, list[s
         f"{path} has none of the actors that are known (it has {', '.join(list(state)[:3]) or 'nothing'}, ...); save "
         "the actor as a torch.nn.Sequential's state dict"
     )
+
+
+def _how_it_acts(
+    path: Path, layout: Layout, facts: Facts | None, activation: str | None, distribution: str | None, command: str
+) -> tuple[str, str]:
+    """Activation and distribution: what the file says of them, else what is given."""
+    if layout.algorithm == "sb3" and facts is None:
+        raise PolicyFileError(f"{path} does not say how the policy acts; give the .zip of Stable-Baselines3's save()")
+    if distribution is not None and layout.distribution is not None:
+        raise PolicyFileError(f"--actions has no effect: the actions of {path} are known; remove it")
+    known = (facts and facts.activation) or layout.activation
+    if facts and known and activation not in (None, known):
+        raise PolicyFileError(f"--activation has no effect: that of {path} is known, {known}; remove it")
+    activation, distribution = activation or known, layout.distribution or distribution
+    if activation is None or distribution is None:
+        raise PolicyFileError(
+            f"{path} does not say its activation and its actions; run `{command} --activation tanh --actions tanh` "
+            "with the ones that it has, and use the new file"
+        )
+    return activation, distribution
+
+
+def _check_sizes(path: Path, task: Task, layers: Sequence[int]) -> None:
+    """Refuse layers (observation, hidden, ..., action) that do not fit the task."""
+    asked = (task.behaviour_size, *layers[1:-1], task.action_size)
+    if layers != asked:
+        raise PolicyFileError(
+            f"{path} has layers of {' x '.join(map(str, layers))}, {task.id} asks for {' x '.join(map(str, asked))} "
+            "(observation, hidden, action); train it on this task"
+        )
 
 
 def _without_renorm(path: Path, state: Mapping[str, np.ndarray], eps: float) -> dict[str, np.ndarray]:
