@@ -28,21 +28,23 @@ def kept_njit(version: str = "", **options: Any) -> Callable[[Callable], Any]:
         cache = compiled._cache
         key_of = cache._index_key
         cache._index_key = lambda signature, codegen: (*key_of(signature, codegen), version)
-        cache.load_overload = _forgiving(cache.load_overload)
-        cache.save_overload = _forgiving(cache.save_overload)
+        cache.load_overload = _forgiving(cache, cache.load_overload)
+        cache.save_overload = _forgiving(cache, cache.save_overload)
         return compiled
 
     return decorate
 
 
-def _forgiving(work: Callable) -> Callable:
-    """The same function, that gives None if the disk fails it."""
+def _forgiving(cache: Any, work: Callable) -> Callable:
+    """The same function of a cache, that gives None if the disk fails it or has a damaged file, which goes."""
 
     def attempt(*arguments: Any) -> Any:
         try:
             return work(*arguments)
-        except OSError as error:
+        except Exception as error:  # a damaged file is of pickle's kinds, or any
             _log.info("compiled code is not kept: %s", error)
+            if not isinstance(error, OSError):
+                cache.flush()
             return None
 
     return attempt

@@ -22,6 +22,7 @@ FAULTS = {
     "a full disk": (caching.IndexDataCacheFile, "save", full),
     "a folder that cannot be read": (caching.IndexDataCacheFile, "load", full),
 }
+DAMAGE = {"nbi": b"", "nbc": b"\x80\x05cut"}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -32,3 +33,15 @@ def test_a_cache_that_fails_stops_nothing(monkeypatch, tmp_path, fault):
     if fault != "a folder that cannot be read":
         with pytest.raises((RuntimeError, OSError)):  # what numba itself does
             numba.njit(cache=True)(double)(2)
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_file_is_made_again(monkeypatch, tmp_path, kind):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    assert kept_njit(nogil=True)(double)(21) == 42
+    [kept] = tmp_path.rglob(f"*.{kind}")
+    whole = kept.read_bytes()
+    kept.write_bytes(DAMAGE[kind])
+    assert kept_njit(nogil=True)(double)(21) == 42
+    again = kept_njit(nogil=True)(double)
+    assert again(21) == 42 and again.stats.cache_hits and kept.stat().st_size == len(whole)

@@ -153,7 +153,8 @@ def _converted(
       level: Level to note in the file.
       activation: Of hidden layers. [default: the program's]
       actions: Plain networks: how the output becomes an action in [-1, 1].
-      statistics (FILE): .npz with "mean" and "std" of normalized observations, in the policy's own order.
+      statistics (FILE): .npz with "mean" and "std" of normalized observations, in the policy's own order, and "clip"
+        if they were not clipped to 10.
     """
     from dmcvb_gen.policies.bundled import CONVERTED
     from dmcvb_gen.policies.convert import convert_file

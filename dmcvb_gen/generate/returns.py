@@ -90,10 +90,10 @@ def _check_levels(levels: Sequence[str], behaviour: str | None, sample: bool) ->
 def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
     """The tasks and levels to evaluate; those that are not asked for are what the policy says."""
     from dmcvb_gen.own_code import is_own
-    from dmcvb_gen.policies.bundled import CONVERTED, levels_of, resolve_policies
+    from dmcvb_gen.policies.bundled import is_foreign, levels_of, resolve_policies
     from dmcvb_gen.policies.policy_file import read_header
 
-    if is_own(behaviour) or Path(behaviour).suffix in CONVERTED:
+    if is_own(behaviour) or is_foreign(Path(behaviour)):
         if len(tasks) != 1:
             raise DmcvbError(f"give the one TASK that {behaviour} is for")
         return tasks, levels or ["expert"]

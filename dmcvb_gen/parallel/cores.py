@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 
-from dmcvb_gen.parallel.memory import CONTAINER, free_memory
+from dmcvb_gen.parallel.memory import free_memory, groups
 
 
 def default_workers(pieces: int, memory: int = 0) -> int:
@@ -24,7 +25,7 @@ def default_workers(pieces: int, memory: int = 0) -> int:
 
 def usable_cores() -> int:
     """Return the number of cores that the system lets this process use, at least 1."""
-    return max(1, int(min(_allowed(), _container())))
+    return max(1, int(min(_allowed(), *map(_granted_by, groups()))))
 
 
 def _allowed() -> float:
@@ -35,10 +36,10 @@ def _allowed() -> float:
         return os.cpu_count() or 1
 
 
-def _container() -> float:
-    """Cores whose time a container may take, rounded up (cgroup v2)."""
+def _granted_by(group: Path) -> float:
+    """Cores whose time a container or job may take, rounded up (cgroup v2)."""
     try:
-        quota, period = (CONTAINER / "cpu.max").read_text().split()
+        quota, period = (group / "cpu.max").read_text().split()
         return math.ceil(int(quota) / int(period))
-    except (OSError, ValueError):  # no container, or one without a limit ("max")
+    except (OSError, ValueError):  # no group of version 2, or one without a limit ("max")
         return math.inf

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import logging
 import re
+import zipfile
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, PolicyFileError
@@ -123,6 +124,11 @@ def _tell(message: str) -> None:
     log.warning(message)
 
 
+def is_foreign(path: Path) -> bool:
+    """Return True for a file of another program's policy; SB3 adds no .zip to a name that has a dot."""
+    return path.is_file() and (path.suffix in CONVERTED or zipfile.is_zipfile(path))
+
+
 def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = None) -> list[Path]:
     """Policy files of a level: bundled ones, or those of `behaviour`.
 
@@ -138,7 +144,7 @@ def resolve_policies(task_id: str, level: str, behaviour: str | Path | None = No
     if behaviour is None:
         return bundled_policies(task_id, level)
     path = checkpoint_of(behaviour) or Path(behaviour)
-    if path.suffix in CONVERTED and path.is_file():
+    if is_foreign(path):
         from dmcvb_gen.policies.convert import converted
 
         return [converted(path, task_id, level)]

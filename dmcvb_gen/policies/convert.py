@@ -37,7 +37,7 @@ from dmcvb_gen.errors import PolicyFileError, first_line
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies.header import PolicyHeader
 from dmcvb_gen.policies.policy_file import check_weights, load_policy, save_policy
-from dmcvb_gen.policies.sb3_zip import Facts, facts_of, read_members
+from dmcvb_gen.policies.sb3_zip import Facts, facts_of, is_sb3, read_members
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.base import Task
@@ -128,7 +128,7 @@ def convert(
       activation: activation of the hidden layers, if it is not the program's own: "relu", "tanh", "elu" or "gelu".
       distribution: of a plain network, "deterministic" (tanh of the output) or "gaussian" (clipped output).
       statistics: .npz file with "mean" and "std" of the observations that it was trained on, in the order in which it
-        takes them, if it normalized them.
+        takes them, if it normalized them; and "clip", if it did not clip them to 10 (SB3, CleanRL) or at all (others).
 
     Raises:
       PolicyFileError: it is not readable without running code, has other sizes, parts that we do not have, or values
@@ -155,8 +155,11 @@ def convert(
             f"{path} was trained behind {wrapper}, whose numbers are not in it; run `{command} --statistics FILE` with "
             "its mean and std of observations (0 and 1 if it normalized none), and use the new file"
         )
-    weights |= _normalization(statistics, task.behaviour_size)
+    normalization, clip = _normalization(statistics, task.behaviour_size)
+    weights |= normalization
     normalizes = bool(weights["observation_mean"].any() or (weights["observation_std"] != 1).any())
+    if clip is None:
+        clip = 10.0 if normalizes and layout.algorithm != "torch" else UNCLIPPED
     network: dict[str, Any] = {"hidden": widths, "activation": activation, "distribution": distribution}
     try:
         header = PolicyHeader(
@@ -168,7 +171,7 @@ def convert(
             agent_step=facts.steps if facts else 0,
             level=level,
             **network,
-            clip_observation=10.0 if normalizes and layout.algorithm != "torch" else UNCLIPPED,
+            clip_observation=clip,
             training={"converted_from": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()},
         )
     except pydantic.ValidationError as error:
@@ -203,7 +206,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any] | None]:
     import torch
 
     try:
-        data, facts = read_members(path) if path.suffix == ".zip" else (path.read_bytes(), None)
+        data, facts = read_members(path) if path.suffix == ".zip" or is_sb3(path) else (path.read_bytes(), None)
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except OSError as error:
         raise PolicyFileError(f"cannot read {path}: {error.strerror or error}; give the path of a policy") from None
@@ -282,9 +285,11 @@ def _check_sizes(path: Path, task: Task, layers: Sequence[int]) -> None:
     """Refuse layers (observation, hidden, ..., action) that do not fit the task."""
     asked = (task.behaviour_size, *layers[1:-1], task.action_size)
     if layers != asked:
+        own = task.observation != "state"
+        cure = f"on {task.observation}, as train-behaviour --algo sb3:NAME does" if own else "on this task"
         raise PolicyFileError(
             f"{path} has layers of {' x '.join(map(str, layers))}, {task.id} asks for {' x '.join(map(str, asked))} "
-            "(observation, hidden, action); train it on this task"
+            f"(observation, hidden, action); train it {cure}"
         )
 
 
@@ -327,7 +332,7 @@ def _scaled(weights: dict[str, np.ndarray], task: Task) -> None:
 
 def _order(path: Path, task: Task, facts: Facts) -> np.ndarray:
     """(observation,) int: the place in the task's observation of each number that the actor takes."""
-    if facts.fields is None:
+    if facts.fields in (None, {"state": task.behaviour_size}):  # the latter of this package's own environments
         return np.arange(task.behaviour_size)
     ours = task.state_fields if task.observation == "state" else {}
     if dict(facts.fields) != dict(ours):
@@ -371,13 +376,17 @@ def _incomplete(path: Path, error: Exception) -> PolicyFileError:
     return PolicyFileError(f"{path} lacks a part of its actor ({error}); save its whole state dict")
 
 
-def _normalization(statistics: str | Path | None, size: int) -> dict[str, np.ndarray]:
-    """The mean and std of observations that a file holds; 0 and 1 without one."""
+def _normalization(statistics: str | Path | None, size: int) -> tuple[dict[str, np.ndarray], float | None]:
+    """The mean and std of observations that a file holds, 0 and 1 without one; what it clips them to, if it says so."""
     if statistics is None:
-        return {"observation_mean": np.zeros(size, np.float32), "observation_std": np.ones(size, np.float32)}
+        return {"observation_mean": np.zeros(size, np.float32), "observation_std": np.ones(size, np.float32)}, None
     try:
         with np.load(statistics, allow_pickle=False) as file, np.errstate(over="ignore"):  # check_weights refuses inf
-            return {f"observation_{name}": np.asarray(file[name], np.float32).reshape(size) for name in ("mean", "std")}
+            moments = {name: np.asarray(file[name], np.float32).reshape(size) for name in ("mean", "std")}
+            clip = float(file["clip"]) if "clip" in file else None
+            if clip is not None and not clip > 0:
+                raise ValueError(f"it clips them to {clip}")
+        return {f"observation_{name}": values for name, values in moments.items()}, clip
     except Exception as error:  # numpy's, zip's and zlib's own kinds, and those of a single array
         raise PolicyFileError(
             f'{statistics} has no "mean" and "std" of {size} observations ({first_line(error)}); write it with '

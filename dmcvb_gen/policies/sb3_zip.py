@@ -50,6 +50,14 @@ class Facts:
     renorm_eps: float
 
 
+def is_sb3(path: Path) -> bool:
+    """Return True for a zip of SB3, whatever its name: save("ppo_0.1M") adds no ending."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return PARAMETERS in archive.namelist()
+
+
 def read_members(path: Path) -> tuple[bytes, dict[str, Any]]:
     """The parameters' bytes and the JSON of a zip.
 

@@ -83,7 +83,8 @@ class ObjectStore(Store):
     def _list(self, prefix: str) -> Mapping[str, int]:
         found = self._system.find(self._full(prefix), detail=True)
         start = len(self.base.lstrip("/")) + 1
-        return {path.lstrip("/")[start:]: facts["size"] for path, facts in found.items()}
+        # A console's "create folder" puts an empty object whose name ends in "/".
+        return {path.lstrip("/")[start:]: facts["size"] for path, facts in found.items() if path[-1] != "/"}
 
     # -- writing ----------------------------------------------------------------------------------
 

@@ -19,8 +19,16 @@ CLIENTS = frozenset(
 """Packages whose exceptions come from a network or a disk."""
 DECODERS = frozenset(("numcodecs", "zarr"))
 """Packages whose exceptions come from damaged bytes."""
-REFUSALS = ("Credential", "AccessDenied", "Forbidden", "InvalidAccessKeyId", "SignatureDoesNotMatch", "Unauthorized")
-"""Words of errors that are about who is asking."""
+REFUSALS = (
+    "Credential",
+    "AccessDenied",
+    "Forbidden",
+    "InvalidAccessKeyId",
+    "SignatureDoesNotMatch",
+    "Unauthorized",
+    "RepositoryNotFound",
+)
+"""Words of errors that are about who is asking; the last is what the Hub says of private repositories."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LONGEST_REASON = 300
 _SECRETS = (
@@ -80,7 +88,8 @@ def _explained(error: Exception, place: str, doing: str, client: bool) -> str:
     url, why, where = is_url(place), reason(error), shown(place)
     if isinstance(error, ImportError):
         package = (error.name or why).split(".")[0]
-        return f"{package} is needed for {where} and not installed: pip install {package}"
+        lacks = "not installed" if isinstance(error, ModuleNotFoundError) else f"too old ({why})"
+        return f"{package} is needed for {where} and {lacks}: pip install -U {package}"
     if not isinstance(error, OSError):
         if client:
             return _not_reached(error, where, doing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -169,13 +170,14 @@ class HubStore(Store):
             if expected not in (ANY, now[last].blob_id if last in now else None):
                 return last in now and now[last].blob_id == _blob(contents[last])
             adds = [CommitOperationAdd(self.folder_there + path, data) for path, data in contents.items()]
-            self._commit(adds, ", ".join(contents), parent_commit=head)
+            self._commit(adds, f"{last} and {len(adds) - 1} files with it", parent_commit=head)
         return True
 
     def _commit(self, operations: Sequence[Any], message: str, **given: Any) -> None:
         """Make a commit, which is the one that is read from then on."""
         given |= {"operations": operations, "commit_message": message}
-        self._commits["read"] = self._api.create_commit(**self._where, **given).oid
+        with _without_bars():
+            self._commits["read"] = self._api.create_commit(**self._where, **given).oid
 
     def tag(self, name: str, message: str) -> None:
         """`name`, after the release's folder if it has one in the repository."""
@@ -183,6 +185,20 @@ class HubStore(Store):
         with self._errors(None, "write to"):
             given = {"tag": name, "tag_message": message, "revision": self._commit_read(), "exist_ok": True}
             self._api.create_tag(**self._where, **given)
+
+
+@contextlib.contextmanager
+def _without_bars() -> Iterator[None]:
+    """The Hub's client draws no bars of its own through ours."""
+    from huggingface_hub import utils
+
+    shown = not utils.are_progress_bars_disabled()
+    utils.disable_progress_bars()
+    try:
+        yield
+    finally:
+        if shown:
+            utils.enable_progress_bars()
 
 
 class _Known(dict[str, Any]):

@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers import FilterObservation
 from sb3_contrib import CrossQ, RecurrentPPO
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -289,19 +290,36 @@ def test_what_is_not_a_plain_mlp_on_the_tasks_own_spaces_is_refused_and_named(
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_zips_of_trained_models_are_taken_and_normalized_ones_need_their_statistics(algorithm, tmp_path):
-    env = VecNormalize(TaskVecEnv(get_task(WALKER), 2)) if algorithm is PPO else TaskVecEnv(get_task(WALKER), 2)
+    env = TaskVecEnv(get_task(WALKER), 2)
+    env = VecNormalize(env, clip_obs=2.0) if algorithm is PPO else env
     short = {"n_steps": 8, "batch_size": 8} if algorithm is PPO else {"learning_starts": 8}
     made = algorithm("MlpPolicy", env, seed=0, device="cpu", **short).learn(32)
-    made.save(tmp_path / "model.zip")
-    words = ["convert-policy", tmp_path / "model.zip", WALKER, "--out", tmp_path / "policy.safetensors"]
+    made.save(tmp_path / "model_0.1M")  # SB3 adds no .zip to a name with a dot
+    words = ["convert-policy", tmp_path / "model_0.1M", WALKER, "--out", tmp_path / "policy.safetensors"]
     if algorithm is PPO:
         assert "VecNormalize, whose numbers are not in it; run `dmcvb-gen convert-policy" in refused(*words)
         seen = env.obs_rms
-        np.savez(tmp_path / "seen.npz", mean=seen.mean, std=np.sqrt(seen.var + env.epsilon))
+        np.savez(tmp_path / "seen.npz", mean=seen.mean, std=np.sqrt(seen.var + env.epsilon), clip=2.0)
         words += ["--statistics", tmp_path / "seen.npz"]
     run(*words)
     observation = np.random.default_rng(0).normal(0, 3, (100, 24)).astype(np.float32)
     wanted, _ = made.predict(env.normalize_obs(observation) if algorithm is PPO else observation, deterministic=True)
+    acted = load_policy(tmp_path / "policy.safetensors").act(observation, deterministic=True)
+    np.testing.assert_allclose(acted, wanted, atol=2e-5)
+
+
+@pytest.mark.parametrize("task_id, setting", [("cartpole-swingup", "none"), ("ant-maze-empty7x7", "visible")])
+def test_policies_of_our_own_environments_states_are_taken_if_behaviours_see_the_same(task_id, setting, tmp_path):
+    env = FilterObservation(gymnasium.make(f"dmcvb_gen/{task_id}-{setting}-v0"), ["state"])
+    made = SAC("MultiInputPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [8]})
+    made.save(tmp_path / "model.zip")
+    words = ["convert-policy", tmp_path / "model.zip", task_id, "--out", tmp_path / "policy.safetensors"]
+    if setting == "visible":
+        assert "train it on proprioception and true goal vectors, as train-behaviour --algo" in refused(*words)
+        return
+    run(*words)
+    observation = np.random.default_rng(0).normal(size=(50, 5)).astype(np.float32)
+    wanted, _ = made.predict({"state": observation}, deterministic=True)
     acted = load_policy(tmp_path / "policy.safetensors").act(observation, deterministic=True)
     np.testing.assert_allclose(acted, wanted, atol=2e-5)
 

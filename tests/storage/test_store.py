@@ -295,6 +295,12 @@ class TestS3(StoreTests):
     def store(self, s3_options):
         return open_store(f"s3://contract/{uuid.uuid4().hex}/r [1] *::x#y?z ~", s3_options)
 
+    def test_the_folders_of_a_console_are_no_files(self, store):
+        for folder in ("", "sub/"):
+            store._system.call_s3("put_object", Bucket="contract", Key=f"{store.base}/{folder}".partition("/")[2])
+        store.create("sub/a", b"1")
+        assert store.list() == {"sub/a": 1}
+
     def test_a_bucket_that_is_not_there_is_said(self, store):
         with pytest.raises(StoreError, match="create the bucket first"):
             open_store("s3://no-such-bucket/x", store.options).create("a", b"1")
@@ -535,7 +541,7 @@ def test_places_are_shown_without_secrets(place):
 
 def test_a_package_that_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gcsfs", None)
-    with pytest.raises(StoreError, match="pip install gcsfs"):
+    with pytest.raises(StoreError, match="pip install -U gcsfs"):
         open_store("gs://bucket/x").read("a", 1)
 
 
