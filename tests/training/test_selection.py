@@ -188,6 +188,15 @@ def test_a_run_folder_is_judged_by_fresh_episodes_and_says_what_is_missing(run_f
     assert json.loads(longer)["convergence"] == given
 
 
+def test_a_run_that_still_rises_is_judged_by_the_papers_convergence(run_folder):
+    for path in sorted((run_folder / "checkpoints").iterdir())[18:]:
+        path.unlink()
+    found = json.loads(invoke("select-checkpoints", run_folder, "--episodes", 3, "--json", code=1).stdout)
+    assert found["convergence"]["value"] == pytest.approx(890.49 / 0.95, abs=0.1)
+    assert found["convergence"]["reason"].startswith("the paper's, as the return still rises (from ")
+    assert "of 0 candidates held 890.5" in found["levels"]["expert"]["reason"]
+
+
 def test_a_folder_that_cannot_be_written_to_is_one_line(run_folder, monkeypatch):
     monkeypatch.setattr(selection, "MEDIUM_SHARE", 2.0)  # no medium, so little is measured
     (run_folder / "curve.png").mkdir()
