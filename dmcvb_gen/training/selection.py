@@ -312,7 +312,7 @@ def select_checkpoints(
     paper = None if is_maze(task.id) else paper_returns(task.id, "expert")
     if convergence is not None:
         end = Convergence(convergence, math.nan, True, "as was given")
-    elif paper and end.value > base and not end.converged:
+    elif paper and end.value > base and not end.converged and len(curve) >= SURE_POINTS:
         end = Convergence(paper["mean"] / EXPERT_SHARE, math.nan, True, f"the paper's, as {end.reason}")
     selection = pick_checkpoints(task.id, curve, base, end, measure)
     expect(progress, len(measured))
