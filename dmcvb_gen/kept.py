@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable
 from typing import Any
@@ -36,7 +37,7 @@ def kept_njit(version: str = "", **options: Any) -> Callable[[Callable], Any]:
 
 
 def _forgiving(cache: Any, work: Callable) -> Callable:
-    """The same function of a cache, that gives None if the disk fails it or has a damaged file, which goes."""
+    """Wrap a function of a cache: it returns None if the disk fails, and empties the cache if a file is damaged."""
 
     def attempt(*arguments: Any) -> Any:
         try:
@@ -44,7 +45,8 @@ def _forgiving(cache: Any, work: Callable) -> Callable:
         except Exception as error:  # a damaged file is of pickle's kinds, or any
             _log.info("compiled code is not kept: %s", error)
             if not isinstance(error, OSError):
-                cache.flush()
+                with contextlib.suppress(OSError):
+                    cache.flush()
             return None
 
     return attempt

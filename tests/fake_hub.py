@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from huggingface_hub.errors import EntryNotFoundError
+from huggingface_hub.utils import are_progress_bars_disabled
 
 from tests.web_server import give_files, serving
 
@@ -75,6 +76,7 @@ class FakeHub:
     def create_commit(self, repo_id, operations, commit_message, repo_type, parent_commit=None):
         if parent_commit not in (None, str(len(self.commits))):
             raise RuntimeError("412 Precondition Failed: a commit has happened since")
+        assert are_progress_bars_disabled() and len(commit_message) < 80  # one bar, ours; a title in a list
         shutil.copytree(self.folder, self.root / "commits" / str(len(self.commits)))
         for operation in operations:
             path = self.folder / operation.path_in_repo

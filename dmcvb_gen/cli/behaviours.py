@@ -174,7 +174,7 @@ def convert_policy(as_json, progress, **options):
 
     Weights are read without unpickling anything. Data of a converted policy regenerate bit for bit. CleanRL's SAC keeps
     its mean alone; CleanRL's PPO and SB3's VecNormalize need --statistics. The zip of an off-policy algorithm does not
-    say whether VecNormalize stood before it.
+    say whether VecNormalize was used.
 
     \b
     dmcvb-gen convert-policy model.zip walker-run --out walker-run.safetensors

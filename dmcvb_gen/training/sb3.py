@@ -2,8 +2,8 @@
 
 Settings are the arguments of the algorithm's class. Policies are exported as everybody's zips are, by
 `policies.convert`. A run goes on from SB3's own parameters and its replay buffer, with new episodes; nothing is
-unpickled. Steps of an on-policy algorithm since its last update are not kept. Observations and rewards are as they are:
-who wants VecNormalize trains with SB3 on an environment of this package and converts the zip.
+unpickled. Steps of an on-policy algorithm since its last update are not kept. Nothing is normalized. To use
+VecNormalize, train with SB3 on an environment of this package, and convert the zip.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def make_model(run: Run) -> BaseAlgorithm:
     try:
         model = algorithm_class(run.config.algorithm)("MlpPolicy", env, seed=seed, device="cpu", **given)
     except Exception as error:  # SB3's, torch's and numpy's own kinds
-        raise DmcvbError(f"{run.config.algorithm} does not accept this: {first_line(error)}; see --set") from None
+        raise DmcvbError(f"{run.config.algorithm} does not accept this: {first_line(error)}; change --set") from None
     model.set_logger(Logger(None, []))  # its own makes a folder in the system's temporary folder each time
     return model
 
@@ -167,9 +167,9 @@ def train(run: Run) -> None:
 
     if run.step < run.config.steps:
         model.learn(run.config.steps - run.step, after_step, log_interval=None, reset_num_timesteps=False)
+    run.save(state_of(model))
     if not model._n_updates:
         raise DmcvbError(
             f"{run.config.algorithm} learned nothing in {run.step:,} steps; give more --steps, or less n_steps, "
             "train_freq or learning_starts with --set"
         )
-    run.save(state_of(model))

@@ -313,7 +313,7 @@ def select_checkpoints(
     if convergence is not None:
         end = Convergence(convergence, math.nan, True, "as was given")
     elif paper and end.value > base and not end.converged and len(curve) >= SURE_POINTS:
-        end = Convergence(paper["mean"] / EXPERT_SHARE, math.nan, True, f"the paper's, as {end.reason}")
+        end = Convergence(paper["mean"] / EXPERT_SHARE, math.nan, True, f"in the paper's run; here {end.reason}")
     selection = pick_checkpoints(task.id, curve, base, end, measure)
     expect(progress, len(measured))
     with storage_errors(folder, "write to"):

@@ -16,6 +16,7 @@ from unittest.mock import Mock
 
 import pytest
 import zarr
+from huggingface_hub.errors import RepositoryNotFoundError
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -537,6 +538,14 @@ PLACES = {
 @pytest.mark.parametrize("place", PLACES)
 def test_places_are_shown_without_secrets(place):
     assert str(Place.parse(place)) == shown(place) == open_store(place).place == PLACES[place]
+
+
+def test_a_private_repository_asks_for_a_token_and_an_old_client_for_a_new_one():
+    hidden = RepositoryNotFoundError("401 Client Error. Repository Not Found for url", response=Mock())
+    with pytest.raises(StoreError, match="refuses access .*HF_TOKEN"), storage_errors("hf://datasets/me/none"):
+        raise hidden
+    with pytest.raises(StoreError, match="too old .*pip install -U zarr"), storage_errors("hf://x"):
+        from zarr import what_a_later_version_has  # noqa: F401
 
 
 def test_a_package_that_is_missing_is_named(monkeypatch):

@@ -193,7 +193,7 @@ def test_a_run_that_still_rises_is_judged_by_the_papers_convergence(run_folder):
         path.unlink()
     found = json.loads(invoke("select-checkpoints", run_folder, "--episodes", 3, "--json", code=1).stdout)
     assert found["convergence"]["value"] == pytest.approx(890.49 / 0.95, abs=0.1)
-    assert found["convergence"]["reason"].startswith("the paper's, as the return still rises (from ")
+    assert found["convergence"]["reason"].startswith("in the paper's run; here the return still rises (from ")
     assert "of 0 candidates held 890.5" in found["levels"]["expert"]["reason"]
 
 
