@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.dataset.gate import Release, Shard, recorded_shards
-from dmcvb_gen.dataset.manifest import MANIFEST, FileRecord, ListedLayer, list_path
+from dmcvb_gen.dataset.manifest import MANIFEST, FileRecord, ListedLayer, canonical_json, list_path
 from dmcvb_gen.dataset.writer import finish_copy, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
@@ -160,12 +160,20 @@ class _Download:
         for first in range(0, len(absent), self._workers):
             few = absent[first : first + self._workers]
             self.bring([file for shard in few for file in shard.files])
-            self.bring([shard.record_file for shard in few])
+            for shard in few:
+                self._record(shard)
 
     def bring(self, files: Sequence[FileRecord]) -> None:
         """Bring files that are not here as they are recorded, some at a time."""
         with ThreadPoolExecutor(max(1, self._workers)) as pool:
             self.moved += sum(pool.map(self._bring_one, files))
+
+    def _record(self, shard: Shard) -> None:
+        """Write the record of a shard whose files are here; its list has said what is in it."""
+        if wrong_bytes(self.target, shard.record_file):
+            self.target.replace(shard.record_path, canonical_json(shard.record))
+            self.moved += 1
+        self._tick(shard.record_file.bytes)
 
     def _bring_one(self, file: FileRecord) -> bool:
         wrong = wrong_bytes(self.target, file)
