@@ -18,7 +18,7 @@ EXTRAS = {
 """Extra -> the modules that it brings."""
 SIMULATOR = ("mujoco", "dm_control", "labmaze", "skfmm", "numba", "scipy", "safetensors", "PIL", "gymnasium")
 """Modules of a whole install that one who only reads may leave out."""
-_PACKAGES = {
+PACKAGES = {
     "stable_baselines3": "stable-baselines3",
     "sb3_contrib": "sb3-contrib",
     "skfmm": "scikit-fmm",
@@ -33,13 +33,13 @@ _PACKAGES = {
 def install_hint(module: str) -> str | None:
     """Say how to install a missing `module` (or its parent); None for a module that no extra brings."""
     top = module.split(".")[0]
-    package = _PACKAGES.get(top, top)
+    package = PACKAGES.get(top, top)
     extras = [f"[{extra}]" for extra, modules in EXTRAS.items() if top in modules]
     if extras:
         bringing = f"the extra {' or '.join(extras)}"
         return f"this needs {package}, which is not installed: pip install {package} (or {bringing})"
     if top == "labmaze":
         return "mazes need labmaze, which has wheels for Python 3.11 and 3.12 only: use one of these, or another task"
-    if top in SIMULATOR or top in _PACKAGES:
+    if top in SIMULATOR or top in PACKAGES:
         return f"this needs {package}, which is not installed: pip install {package} (a whole install brings it)"
     return None

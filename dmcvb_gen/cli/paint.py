@@ -16,9 +16,8 @@ from dmcvb_gen.text import pluralize
 def paint(release, as_json, **options):
     """Render the images of a release stored without pixels, and compare them with their known digests.
 
-    Rerun the command to resume. With --size or --views the release grows,
-    and its digest changes. Other distractors or renderers: `dmcvb-gen repaint`. Exit code 1 if images differ
-    from the known ones.
+    Rerun the command to resume. With --size or --views a release grows, and its digest changes; that of a fetched
+    part stays. Other distractors or renderers: `dmcvb-gen repaint`. Exit code 1 if images differ from the known ones.
 
     \b
     dmcvb-gen rollout walker-walk --no-pixels --out releases/light

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError, StoreError
+from dmcvb_gen.extras import PACKAGES
 from dmcvb_gen.storage.places import is_url, shown
 
 CLIENTS = frozenset(
@@ -89,7 +90,7 @@ def _explained(error: Exception, place: str, doing: str, client: bool) -> str:
     if isinstance(error, ImportError):
         package = (error.name or why).split(".")[0]
         lacks = "not installed" if isinstance(error, ModuleNotFoundError) else f"too old ({why})"
-        return f"{package} is needed for {where} and {lacks}: pip install -U {package}"
+        return f"{package} is needed for {where} and {lacks}: pip install -U {PACKAGES.get(package, package)}"
     if not isinstance(error, OSError):
         if client:
             return _not_reached(error, where, doing)

@@ -83,8 +83,8 @@ def train_behaviour(
       out: Folder of the run. [default: runs/TASK, runs/ring for ring.txt]
       steps: Agent steps (at action repeat 2). [default: the task's]
       seed: Random seed. [default: 0]
-      algo: sac, mpo, guided (mazes), or sb3:A2C, CrossQ, DDPG, PPO, SAC, TD3, TQC, TRPO. [default: sac; a maze's file:
-        guided]
+      algo: sac, mpo, guided (mazes), or sb3:NAME, with A2C, CrossQ, DDPG, PPO, SAC, TD3, TQC or TRPO. [default: sac; a
+        maze's file: guided]
       settings (KEY=VALUE): Override a setting, e.g. learning_rate=0.0003.
       init_from (RUN|FILE): Run or policy file to start from; guided: the policy that walks.
       evaluate_every: Agent steps between evaluations, and so between checkpoints. [default: the task's]
@@ -98,7 +98,6 @@ def train_behaviour(
     """
 
     from dmcvb_gen.policies.paper import paper_returns
-    from dmcvb_gen.precision import choose_precision
     from dmcvb_gen.progress import ProgressBar
     from dmcvb_gen.storage.places import local_path
     from dmcvb_gen.tasks import typed_task
@@ -116,8 +115,6 @@ def train_behaviour(
     algorithm = algo or (found.algorithm if found else "guided" if maze else "sac")
     given = dict(steps=steps, seed=seed, evaluate_every=evaluate_every, init_from=init_from and str(init_from))
     asked = parse_settings(as_names(settings), algorithm)
-    if algorithm == "sac" and not found:
-        asked = {"bfloat16": choose_precision("auto") == "bfloat16"} | asked
     run = open_run(folder, run_config(task_id, algorithm, asked, found, **given), resume)  # type: ignore[arg-type]
     saved = run.saved()
     done, total = saved["step"] if saved else 0, run.config.steps

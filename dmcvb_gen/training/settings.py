@@ -110,15 +110,22 @@ def parse_settings(pairs: Sequence[str], algorithm: str) -> dict[str, Any]:
 
 
 def default_run(task_id: str, algorithm: str = "sac") -> dict[str, Any]:
-    """{"steps", "evaluate_every", "settings"} of a task's run; settings are those that are not the algorithm's own."""
+    """{"steps", "evaluate_every", "settings"} of a task's run; settings are those that are not the algorithm's own.
+
+    The precision of `sac` is the one that this processor computes fast in.
+    """
     family = ANT_MAZE if is_maze(task_id) else task_id
     defaults = read_yaml(resources.files("dmcvb_gen.training") / "defaults.yaml")
     values: dict[str, Any] = {"settings": {}}
     for name in ("all", family, f"{family}/{algorithm}"):
         values |= defaults.get(name, {})
-    if is_own(task_id) and algorithm == "sac":
-        from dmcvb_gen.tasks import get_task
+    if algorithm != "sac":
+        return values
+    from dmcvb_gen.precision import choose_precision
+    from dmcvb_gen.tasks import get_task
 
+    if is_own(task_id):
         steps = WARMUP_EPISODES * get_task(task_id).max_steps
         values["settings"] = {"warmup_steps": min(max(steps, SHORTEST_WARMUP), LONGEST_WARMUP)}
+    values["settings"] = {"bfloat16": choose_precision("auto") == "bfloat16"} | values["settings"]
     return values
