@@ -134,7 +134,7 @@ SMALL = {"simulations": 4, "batch_size": 8, "actor_hidden": [8], "critic_hidden"
 
 
 def lines_of(folder, task, algorithm="sac", done=0, **given):
-    settings = SMALL if algorithm in ("sac", "mpo") else {}
+    settings = {"sac": SMALL | {"bfloat16": False}, "mpo": SMALL}.get(algorithm, {})
     return plan_of(Run(folder, run_config(task, algorithm, settings, **given)), done)
 
 
