@@ -118,19 +118,21 @@ def _checked(name: str, value: Any, annotation: Any) -> Any:
     except pydantic.ValidationError as error:
         reason = error.errors()[0]["msg"]
         raise DmcvbError(f"{name} is {value!r}: {reason[0].lower()}{reason[1:]}") from None
-    if PLACE in marks and taken == "":
-        raise DmcvbError(f"{name} is empty; give a place, or leave it out")
+    if PLACE in marks and (taken == "" or (SEVERAL in marks and taken and "" in taken)):
+        raise DmcvbError(f"{name} is empty; give a value, or leave it out")
     if RANGE in marks and taken is not None and not 0 <= taken[0] < taken[1]:
         raise DmcvbError(f"{name} is {value!r}: give (A, B) with 0 <= A < B")
     return taken
 
 
 def parts_of(annotation: Any) -> tuple[list[Any], list[Any]]:
-    """The types of a union but None, and the marks that `Annotated` sets on them."""
+    """The types of a union but None, and the marks that `Annotated` sets on them or on each of several."""
     if typing.get_origin(annotation) is Annotated:
         inner, *marks = typing.get_args(annotation)
         kinds, more = parts_of(inner)
         return kinds, [*marks, *more]
+    if Ellipsis in typing.get_args(annotation):
+        return [annotation], parts_of(typing.get_args(annotation)[0])[1]
     if typing.get_origin(annotation) not in (typing.Union, types.UnionType):
         return ([] if annotation is type(None) else [annotation]), []
     parts = [parts_of(part) for part in typing.get_args(annotation)]

@@ -7,7 +7,10 @@ worker count, order or machine, so any episode can be made again by itself.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import random
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -17,6 +20,20 @@ STREAMS = ("initial_state", "policy", "camera", "color", "background", "style", 
 No distractor draws from "shake" any more."""
 DISTRACTOR_STREAMS = tuple(name for name in STREAMS if name not in ("initial_state", "policy"))
 """Those that the simulation leaves to distractors."""
+
+
+@contextlib.contextmanager
+def generators_kept() -> Iterator[None]:
+    """Leave the caller's own generators of Python, numpy and torch as they were: a training seeds them."""
+    import torch
+
+    python, legacy = random.getstate(), np.random.get_state()
+    try:
+        with torch.random.fork_rng(range(torch.cuda.device_count())):
+            yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(legacy)
 
 
 def name_key(*names: str) -> tuple[int, ...]:

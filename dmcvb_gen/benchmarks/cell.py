@@ -49,6 +49,7 @@ from dmcvb_gen.generate.inputs import video_source
 from dmcvb_gen.loaders.painted import DEFAULT_CACHE, Painting, painted_release
 from dmcvb_gen.parallel import Needs, ProgressCallback, Workers, ignore, open_pool
 from dmcvb_gen.policies.evaluation import goal_scores
+from dmcvb_gen.seeding import generators_kept
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.version import __version__
 
@@ -182,6 +183,7 @@ class CellRun:
         """A file of the cell, e.g. its ".json"."""
         return file_of(self.out, self.cell, suffix)
 
+    @generators_kept()
     def result(self) -> dict[str, Any]:
         """Train and score it, unless its result is there.
 

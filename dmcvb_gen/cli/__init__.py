@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import difflib
 import importlib
 import logging
@@ -101,6 +102,8 @@ class LazyGroup(click.Group):
             return super().invoke(ctx)
         except KeyboardInterrupt:
             _end_interrupted(ctx)
+        except click.exceptions.NoArgsIsHelpError:
+            raise
         except Exception as error:
             if _asked_to_stop.is_set():  # Ctrl-C within foreign code comes out as that code's own kind of error
                 _end_interrupted(ctx)
@@ -152,12 +155,18 @@ def _end_interrupted(context: click.Context) -> NoReturn:
     context.exit(INTERRUPTED)
 
 
+def _stop_again(lost: sys.UnraisableHookArgs) -> None:
+    """Ctrl-C within a callback of foreign code is lost there, so it comes once more."""
+    if lost.exc_type is KeyboardInterrupt:
+        _thread.interrupt_main()
+
+
 def _stop_on_signals(context: click.Context) -> None:
     """SIGTERM ends a command as Ctrl-C does: its workers stop with it, what is finished stays."""
 
     def stop(*_):
         _asked_to_stop.set()
-        sys.unraisablehook = lambda *_: None  # what is half begun (an event loop, say) has nothing to tell any more
+        sys.unraisablehook = _stop_again  # what is half begun (an event loop, say) has nothing to tell any more
         logging.getLogger("asyncio").disabled = True  # nor have the tasks of that loop
         warnings.simplefilter("ignore")
         raise KeyboardInterrupt

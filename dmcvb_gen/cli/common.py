@@ -29,7 +29,11 @@ class GroupedCommand(click.Command):
         self.option_groups = option_groups or {}
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        *_, order = self.make_parser(ctx).parse_args(args=list(args))
+        try:
+            *_, order = self.make_parser(ctx).parse_args(args=list(args))
+        except click.UsageError as error:
+            error.ctx = error.ctx or ctx  # names the command whose --help to read
+            raise
         single = [each for each in order if isinstance(each, click.Option) and not (each.multiple or each.is_flag)]
         if twice := [each for number, each in enumerate(single) if each in single[:number]]:
             raise click.UsageError(f"{twice[0].opts[0]} is given twice, and takes one value; give one of them", ctx)

@@ -105,7 +105,10 @@ def parameters_of(function: Callable, arguments: Sequence[str] = ()) -> list[cli
 
 def help_of(function: Callable) -> dict[str, tuple[str | None, str]]:
     """Parameter -> (metavar, help), from the "Args:" of its docstring."""
-    block = inspect.getdoc(function).partition("\nArgs:\n")[2].partition("\n\n")[0]
+    documented = inspect.getdoc(function)
+    if documented is None:
+        raise click.UsageError("options are read from docstrings, which python -OO leaves out; unset PYTHONOPTIMIZE=2")
+    block = documented.partition("\nArgs:\n")[2].partition("\n\n")[0]
     found = re.findall(r"^  (\w+)(?: \((.+?)\))?: (.+(?:\n   .+)*)", block, re.MULTILINE)
     found = [(name, METAVARS.get(metavar, metavar), text) for name, metavar, text in found]
     return {name: (metavar or None, re.sub(r"\s+", " ", text).replace(" [d", "  [d")) for name, metavar, text in found}
@@ -143,13 +146,13 @@ class WorkersType(click.IntRange):
 
 
 class PlaceType(click.ParamType):
-    """A folder, file or URL; not the empty text of an unset variable."""
+    """A folder, file, URL or name; not the empty text of an unset variable."""
 
     name = "text"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         if value == "":
-            raise click.UsageError(f"{param.get_error_hint(ctx)} is empty; give a place, or leave it out")
+            raise click.UsageError(f"{param.get_error_hint(ctx)} is empty; give a value, or leave it out")
         return value
 
 

@@ -60,7 +60,9 @@ def _painted_facts(done):
 def _painted(place, done):
     """Yield the result of painting in lines."""
     rendered = f"Rendered {pluralize(done.shards, 'shards')}. {_compared(done)}."
-    yield f"{place}: {rendered if done.shards else 'All local shards have images already.'}"
+    there = any(map(len, done.release.subsets.values()))
+    nothing = "All local shards have images already." if there else "No episodes are here yet."
+    yield f"{place}: {rendered if done.shards else nothing}"
     yield from (f"  differs: {name}" for name in done.differing[:10])
 
 

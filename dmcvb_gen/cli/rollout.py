@@ -96,7 +96,10 @@ def begin(as_json, progress, other_versions, **options):
 @click.argument("release", metavar="RELEASE|URL")
 @click.argument("part", metavar="K/N")
 def part(release, part, as_json, workers, other_versions, only, episode_range, storage_options, progress):
-    """Make part K of N of a release that was begun: every N-th shard, starting with the K-th."""
+    """Make part K of N of a begun release.
+
+    A part is every N-th shard, starting with the K-th.
+    """
     from dmcvb_gen.generate.plan import make_plan, start
     from dmcvb_gen.storage.store import open_store
 

@@ -26,7 +26,7 @@ from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
 from dmcvb_gen.generate.render import distractor_state_of, label_arrays, paint, paint_labels, renderers, videos_of
-from dmcvb_gen.generate.resolve import code_of_distractor, code_of_task
+from dmcvb_gen.generate.resolve import check_code, check_task_code, code_of_distractor
 from dmcvb_gen.generate.works import Setting, Work
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.policies.actor import Policy, RandomPolicy
@@ -136,6 +136,7 @@ def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> W
       StoreError: what is read is damaged, other bytes are there, or the place is full or cannot be written.
     """
     first = work.settings[0].record
+    check_task_code(first.task, work.trajectories)  # its model is painted, too
     if work.trajectories.name in work.make:
         episodes = simulated_episodes(work, first, threads)
         outcomes = [_settle(work, work.trajectories, episodes.arrays.items())]
@@ -159,7 +160,7 @@ def _make_setting(work: Work, setting: Setting, episodes: Episodes, tick: Progre
     record, root = setting.record, local_inputs(work.store, work.inputs)
     backgrounds = background_source(root, record, work.backgrounds)
     if makes_labels:
-        _check_code(record.distractor.kind, setting.labels.makes, code_of_distractor(record.distractor))
+        check_code(record.distractor.kind, setting.labels.makes, code_of_distractor(record.distractor))
         labels = _drawn_labels(work, record, episodes, backgrounds)
         yield _settle(work, setting.labels, label_arrays(labels, episodes.length, work.trajectories.rows))
     else:
@@ -183,7 +184,6 @@ def _plain(spec: ArraySpec) -> str:
 def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episodes:
     """Simulate the episodes of a shard."""
     task, makes = get_task(record.task).at(record.action_repeat), work.trajectories.makes
-    _check_code(record.task, makes, code_of_task(record.task))
     pairs = None
     if makes["fixed_goals"]:
         per_goal = makes["episodes_per_goal"]
@@ -203,14 +203,6 @@ def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episod
         max_steps=record.max_steps,
     )
     return Episodes(made.episodes, made.arrays())
-
-
-def _check_code(name: str, makes: Mapping[str, Any], now: Any) -> None:
-    """Raises StoreError if the code of one's own that a layer was begun with is another one now."""
-    if makes.get("code", now) != now:
-        raise StoreError(
-            f"the code of {name} has changed since the release was begun; put the old file back, or give another --out"
-        )
 
 
 @functools.lru_cache(maxsize=4)

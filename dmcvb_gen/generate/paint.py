@@ -21,7 +21,7 @@ from dmcvb_gen.dataset.writer import begin, finish, read_provenance, write_prove
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs
-from dmcvb_gen.generate.resolve import all_pictures, image_layers, rendering_facts
+from dmcvb_gen.generate.resolve import all_pictures, check_task_code, image_layers, rendering_facts
 from dmcvb_gen.generate.works import can_be_rendered, chosen_subsets, works_of
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.rendering.base import check_size
@@ -134,8 +134,14 @@ def paint_release(
 
 
 def not_imported(release: Release, records: Iterable[SubsetRecord]) -> list[SubsetRecord]:
-    """Those of a release's subsets that can be painted. Raises StoreError if all were imported."""
+    """Those of a release's subsets that can be painted.
+
+    Raises:
+      StoreError: all were imported, or the code of a task of one's own has changed.
+    """
     own = [record for record in records if not record.imported]
+    for record in own:
+        check_task_code(record.task, release.layers[record.layers[0]])
     if not own:
         raise StoreError(f"{release.place} was imported and has no physics states to paint from")
     return own

@@ -5,6 +5,7 @@ The engine, the checks and the readers that render on demand share it.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
@@ -68,8 +69,8 @@ def videos_of(setting: DistractorSetting, backgrounds: str, split: str) -> Backg
     return None if setting.kind == "none" else load_backgrounds(backgrounds, split)
 
 
-class RendererCache:
-    """Keeps the last renderers of a task, which are large: the settings of a work take turns."""
+class RendererCache(threading.local):
+    """Keeps a thread's last renderers of a task, which are large: the settings of a work take turns."""
 
     def __init__(self) -> None:
         self._made: dict[tuple, Renderer] = {}
@@ -93,7 +94,7 @@ class RendererCache:
 
 
 renderers = RendererCache()
-"""The renderers of this process."""
+"""The renderers of this process, of each thread its own: one thread at a time may use a renderer."""
 
 
 def distractor_state_of(

@@ -39,7 +39,7 @@ from dmcvb_gen.dataset.writer import file_facts
 from dmcvb_gen.distractor_state import OPTIONAL_LABELS
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.distractors.registry import BUILT_IN, distractors_of
-from dmcvb_gen.errors import BackgroundError, RecipeError
+from dmcvb_gen.errors import BackgroundError, RecipeError, StoreError
 from dmcvb_gen.generate.inputs import BUILTIN
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD, NATIVE, Recipe, SubsetRequest, expand
@@ -230,6 +230,20 @@ def code_of_task(task: str) -> str:
         return ""
     model = model_digest(get_task(task).model)  # which imports the file
     return hashlib.sha256((source_digest(task.partition(":")[0]) + model).encode()).hexdigest()
+
+
+def check_code(name: str, makes: Mapping[str, Any], now: Any) -> None:
+    """Raises StoreError if the code of one's own that a layer was begun with is another one now."""
+    if makes.get("code", now) != now:
+        raise StoreError(
+            f"the code of {name} has changed since the release was begun; put the old file back, or roll out another "
+            "release"
+        )
+
+
+def check_task_code(task: str, trajectories: Layer) -> None:
+    """Raises StoreError if a task of one's own is not the one that made these trajectories."""
+    check_code(task, trajectories.makes, code_of_task(task))
 
 
 def code_of_distractor(setting: DistractorSetting) -> list[str]:

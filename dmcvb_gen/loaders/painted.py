@@ -26,7 +26,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs, whose_videos
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.render import distractor_state_of, paint, renderer_for
-from dmcvb_gen.generate.resolve import all_pictures, drawn_labels
+from dmcvb_gen.generate.resolve import all_pictures, check_task_code, drawn_labels
 from dmcvb_gen.loaders.arrays import ComputedArray
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.rendering.base import Renderer, check_size
@@ -205,6 +205,7 @@ class PaintedSubset(SubsetReader):
 
     @functools.cached_property
     def _painter(self) -> tuple[Renderer, Any]:
+        check_task_code(self.task, self.trajectories)
         return renderer_for(self.record, self._videos())
 
     def _drawn_of(self, episode: int) -> Drawn:

@@ -20,6 +20,7 @@ from dmcvb_gen.dataset.pictures import shown
 from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
+from dmcvb_gen.generate.resolve import check_task_code
 from dmcvb_gen.release.export.episodes import png
 
 if TYPE_CHECKING:
@@ -108,6 +109,7 @@ def _frames(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:
         frames[episode] = subset.array(name)[episode, 0]
     if len(lacking) and not subset.record.imported:
         source = background_source(subset.release.path, subset.record)
+        check_task_code(subset.task, subset.trajectories)
         with contextlib.closing(renderer_for(subset.record, source)[0]) as renderer:
             physics, labels = subset.read("physics", lacking)[:, 0], subset.labels(lacking)[:, 0]
             made = renderer.render(physics, labels, views=[pictures.views[0]], hide_goal=pictures.hide_goal)[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,7 +48,8 @@ class Place:
             return cls("file", _folder(text))
         protocol, rest = found[1].lower(), text[found.end() :]
         if protocol in ("file", "local"):
-            return cls("file", _folder(re.sub("^//(localhost(?=/))?", "", text[len(protocol) + 1 :])))
+            path = re.sub("^//(localhost(?=/))?", "", text[len(protocol) + 1 :])
+            return cls("file", _folder(unquote(path) if found[2][:2] == "//" else path))
         if len(found[2]) != 2 and protocol in (*BUCKETS, *WEB, "hf", "s3a", "gcs", "abfs"):
             meant = f"{protocol}://{_without_login(rest)[0]}"
             raise StoreError(f"a URL of {protocol} needs two slashes; did you mean {shown(meant)}?")
@@ -133,6 +135,12 @@ def _without_login(rest: str) -> tuple[str, str]:
 
 def _folder(text: str) -> str:
     try:
-        return str(Path(text).expanduser())
+        folder = Path(text).expanduser()
+        if folder.is_symlink() and not folder.exists():
+            raise StoreError(f"{text} is a link to nothing; remove it, or choose another place")
     except RuntimeError:
         raise StoreError(f"{text}: there is no home folder here; write the folder out") from None
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise StoreError(f"{text[:80]}... is too long for a folder's name; choose another place") from None
+    return str(folder)

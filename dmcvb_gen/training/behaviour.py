@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Count, Local, Location, Names, Seed, checked
 from dmcvb_gen.parallel import ignore
+from dmcvb_gen.seeding import generators_kept
 from dmcvb_gen.spec import MazeName, task_folder
 from dmcvb_gen.text import as_names
 
@@ -62,6 +63,7 @@ def _one_thread() -> Iterator[None]:
 
 @_one_thread()
 @checked
+@generators_kept()
 def train_behaviour(
     task: Location | None = None,
     *,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -481,7 +482,9 @@ def test_returns_unlike_the_policys_own_fail(release):
 def test_returns_of_actions_held_for_longer_are_compared_with_nothing(repeat, tmp_path):
     """At repeat 1 the policies hold their actions for two steps, as when they were measured."""
     roll_out(small_recipe(levels="expert", settings="none", episodes=4, action_repeat=repeat), tmp_path / "repeat")
+    generator = torch.get_rng_state()
     result = validate(tmp_path / "repeat", out=tmp_path / "out", agents="state-bc", workers=1)
+    assert torch.equal(torch.get_rng_state(), generator), "the caller's own numbers go on"
     facts = json.loads(result.facts.read_text())
     assert result.sound and not result.warnings, result.structure
     [returns], [score] = facts["returns"].values(), facts["results"]

@@ -35,7 +35,7 @@ ROLLOUTS = [
     ("walker-walk --samples 3", "'--samples': '3' is not one of"),
     ("walker-walk --max-steps 99999999999", "--max-steps is 99999999999: Input should be less than or equal to 5000"),
     ("walker-walk --episodes-per-shard 9999", "--episodes-per-shard is 9999: Input should be less than"),
-    ("--recipe=", "'--recipe' is empty; give a place"),
+    ("--recipe=", "'--recipe' is empty; give a value"),
     ("walker-walk --renderer povray", "opengl"),
     ("walker-walk --range 5:2", "A < B"),
     ("walker-walk --range ²:³", "A < B"),
@@ -76,6 +76,9 @@ OTHERS = [
     ("--fast", "`dmcvb-gen --help` lists the options"),
     ("rolout", "Did you mean 'rollout'?"),
     ("info", "see `dmcvb-gen info --help`"),
+    ("rollout walker-walk --level", "see `dmcvb-gen rollout --help`"),
+    (f"rollout walker-walk --level random --out {'x' * 300}", "is too long for a folder's name"),
+    ("rollout walker-walk --level random --out nowhere", "is a link to nothing"),
     ("rollout walker-walk --level random --no-pixels --out hole.txt/r", "hole.txt is a file; choose another place"),
     ("info empty", "holds no release"),
     ("info r --option a=1 --option b=2 --json --json", "--option has no effect"),
@@ -134,8 +137,8 @@ OTHERS = [
     ("validate r --only foo*", "unknown subset pattern 'foo*'"),
     ("publish r s3:/bucket/demo", "did you mean s3://bucket/demo?"),
     ("fetch s3:/bucket/demo --out new", "did you mean s3://bucket/demo?"),
-    ("fetch file:r --out=", "'--out' is empty; give a place"),
-    ("rollout walker-walk --out=", "'--out' is empty; give a place"),
+    ("fetch file:r --out=", "'--out' is empty; give a value"),
+    ("rollout walker-walk --out=", "'--out' is empty; give a value"),
 ]
 PLACED = ["info r", "cluster finish r", "publish r mine", "fetch r --out mine", "export r --to hdf5 --out mine"]
 OTHERS += [(f"{command} --option a=b", "is a folder") for command in PLACED]
@@ -150,6 +153,7 @@ def place(tmp_path_factory, small_release):
     """A folder with a release and files that are wrong in a way."""
     folder = tmp_path_factory.mktemp("place")
     (folder / "r").symlink_to(small_release)
+    (folder / "nowhere").symlink_to("gone")
     (folder / "empty").mkdir()
     (folder / "broken").mkdir()
     (folder / "broken/bad.mp4").write_bytes(b"nothing like a video" * 20)
@@ -186,8 +190,9 @@ PYTHON = [
     (lambda out: dmcvb_gen.rollout("walker-walk", episode_range="0:1", out=out), "^episode_range is '0:1': input"),
     (lambda out: dmcvb_gen.rollout("walker-walk", workers=-3, out=out), "^workers is -3: input should be greater"),
     (lambda out: dmcvb_gen.rollout(None, out=out), "^tasks is None"),
-    (lambda out: dmcvb_gen.rollout("walker-walk", behaviour="", out=out), "behaviour is empty; give a place, or leave"),
-    (lambda out: dmcvb_gen.rollout("walker-walk", out=""), "^out is empty; give a place"),
+    (lambda out: dmcvb_gen.rollout("", out=out), "^tasks is empty"),
+    (lambda out: dmcvb_gen.rollout("walker-walk", behaviour="", out=out), "behaviour is empty; give a value, or leave"),
+    (lambda out: dmcvb_gen.rollout("walker-walk", out=""), "^out is empty; give a value"),
     (lambda out: dmcvb_gen.rollout("walker-walk", max_steps=9999, out=out), "^max_steps is 9999: Input"),
     (lambda out: dmcvb_gen.rollout(TWINS, levels="random", out=out), "two mazes are called ant-maze-twin; rename"),
     (lambda out: dmcvb_gen.paint(out, views=[]), "views names no view"),

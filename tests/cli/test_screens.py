@@ -38,6 +38,11 @@ def test_tables_fit_80_columns_and_cut_no_word(small_release, small_mazes, tmp_p
             assert any(word in line for line in lines), (arguments, word, lines)
 
 
+def test_a_group_without_a_command_prints_its_help():
+    said = CliRunner().invoke(main, ["cluster"])
+    assert said.exit_code == 2 and said.output.startswith("Usage: ") and "finish  Write the manifest" in said.output
+
+
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), *(["cluster", name] for name in PARTS)])
 def test_help_fits_80_columns_and_has_an_example(command):
     lines = screen([*command, "--help"])

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+import dmcvb_gen
 from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate import resolve
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.plan import make_plan, run_plan, start
@@ -74,6 +77,12 @@ def test_two_who_make_the_same_shards_end_in_one_release(whole, tmp_path):
     assert run_plan(plan, 1)[0].digest == whole.digest  # the first three are made a second time
 
 
+def test_threads_of_one_process_make_releases_side_by_side(whole, tmp_path):
+    with ThreadPoolExecutor(3) as pool:
+        made = list(pool.map(lambda name: roll_out(quick_recipe(), tmp_path / name), "abc"))
+    assert {release.digest for release in made} == {whole.digest}
+
+
 def test_parts_and_repeated_begins_obey_the_renderer_of_the_begun_release(tmp_path, monkeypatch):
     """Another machine, without OpenGL, would choose otherwise."""
     words = ["walker-walk", "--level", "random", "--episodes", 1, "--max-steps", 3, "--out", tmp_path / "r"]
@@ -98,6 +107,19 @@ def test_parts_notice_that_code_of_ones_own_has_changed(task, tmp_path, monkeypa
     monkeypatch.setattr(resolve, "source_digest", lambda module: "0" * 64)
     refused = invoke("cluster", "part", tmp_path / "r", "1/1", code=2).output
     assert f"the code of {'grey' if OWN[task] != 'none' else task} has changed since" in refused
+
+
+def test_images_of_a_task_of_ones_own_that_has_changed_are_not_painted(tmp_path, monkeypatch):
+    light = tmp_path / "light"
+    words = ["tests.tasks.hostile_tasks:plain", "--level", "random", "--episodes", 1, "--max-steps", 3, "--size", 16]
+    run("rollout", *words, "--no-pixels", "--out", light)
+    monkeypatch.setattr(resolve, "source_digest", lambda module: "0" * 64)
+    others = [["repaint", light, "--out", tmp_path / "other"], ["view", light, "--out", tmp_path / "page.html"]]
+    for command in (["paint", light], ["paint", light, "--size", 24], ["card", light], *others):
+        assert "has changed since the release was begun" in invoke(*command, code=2).output
+    with pytest.raises(StoreError, match="has changed"):
+        dmcvb_gen.open(light, paint=True)["tests.tasks.hostile_tasks-plain/random/none"].episode(0)
+    assert len(Release.open(light).recipes) == 1 and not (tmp_path / "other").exists()
 
 
 @pytest.mark.slow

@@ -268,6 +268,8 @@ class TestFolder(StoreTests):
         assert open_store(tmp_path / "other").read("a", 1) == b"1"
         monkeypatch.setenv("HOME", str(tmp_path))
         assert open_store("~/r").folder == open_store("file:~/r").folder == tmp_path / "r"
+        spaced = tmp_path / "a folder of 100%"
+        assert open_store(spaced.as_uri()).folder == open_store(f"file:{spaced}").folder == spaced
         monkeypatch.delenv("HOME")
         monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
         with pytest.raises(StoreError, match="there is no home folder here"):

@@ -5,6 +5,7 @@ import io
 import multiprocessing
 import os
 import pathlib
+import random
 import shutil
 import signal
 
@@ -225,7 +226,7 @@ def test_a_finished_run_that_went_a_few_steps_too_far_resumes_to_what_it_is(tmp_
         train_behaviour(out=tmp_path / "run", resume=True, progress=False)
 
 
-def test_training_leaves_the_callers_threads_and_figures_alone(tmp_path):
+def test_training_leaves_the_callers_threads_figures_and_generators_alone(tmp_path):
     import matplotlib
 
     before, backend = torch.get_num_threads(), matplotlib.get_backend()
@@ -233,7 +234,10 @@ def test_training_leaves_the_callers_threads_and_figures_alone(tmp_path):
     matplotlib.use("svg")
     try:
         train(tmp_path / "run", steps=80)
-        train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, progress=False)
+        generators = torch.get_rng_state(), random.getstate(), np.random.get_state()[1].copy()
+        train_behaviour("cheetah-run", out=tmp_path / "run", resume=True, steps=100, progress=False)
+        assert torch.equal(torch.get_rng_state(), generators[0]) and random.getstate() == generators[1]
+        assert np.array_equal(np.random.get_state()[1], generators[2])
         assert torch.get_num_threads() == 2 and matplotlib.get_backend() == "svg"
     finally:
         torch.set_num_threads(before)
