@@ -25,9 +25,8 @@ Around them:
     layout.py      where every number lies, how loops reach it, what is compiled once a machine (about a minute)
     renderer.py    the `Renderer`: batches, caches, hidden goals
 
-A new kind of convex geom needs `visibility.through_solid` (where a ray enters and leaves it) and `half_length`, a
-radius in `scene._ball_radius`, and its number in `scene`. Meshes, skins, height fields and transparent bodies are
-missing.
+A new kind of convex geom needs `visibility.through_solid` (where a ray enters and leaves it), a radius in
+`scene._ball_radius`, and its number in `scene`. Meshes, skins, height fields and transparent bodies are missing.
 """
 
 from dmcvb_gen.rendering.native.renderer import NativeRenderer

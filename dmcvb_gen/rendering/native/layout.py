@@ -92,7 +92,7 @@ def distinct(typing):
 # -- compiled code ---------------------------------------------------------------------------------
 # -- columns of `rec`: what a look says of a geom
 KIND = 0  # of `scene`: PLANE, SPHERE, CAPSULE, ...
-SIZE = 1  # 3: half lengths, as MuJoCo's
+SIZE = 1  # 3: half lengths, a solid's along its axes, others' as MuJoCo's
 GOAL = 4  # 1 for the goal's geoms
 MOVING = 5  # 1 for geoms that can move
 BOXED = 6  # 1 for a plane on a box's side, seen from behind only from inside the box

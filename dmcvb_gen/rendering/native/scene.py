@@ -113,6 +113,7 @@ def scene_of(task: Task) -> Scene:
         grid, lines = _vertices(size[gridded])
         rec[gridded, L.GRIDDED] = 1
     rec[:, L.KIND], rec[:, L.SIZE : L.SIZE + 3], rec[:, L.BALL] = kind, size, _ball_radius(kind, size)
+    rec[kind == CYLINDER, L.SIZE + 1 : L.SIZE + 3] = size[kind == CYLINDER, :2]  # a radius, half a length
     rec[:, L.GOAL], rec[:, L.BOXED] = np.isin(geoms, task.goal_geoms), _boxed(model, geoms, boxes) & (kind == PLANE)
     rec[:, L.MOVING] = moving[seen] | bool(task.model_entries)
     rec[:, L.CORD] = np.arange(len(rec)) >= len(rec) - len(ends)

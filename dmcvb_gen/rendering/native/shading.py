@@ -16,7 +16,7 @@ from dmcvb_gen.rendering.native.layout import distinct, get, get3, leaf, part, p
 from dmcvb_gen.rendering.native.lighting import terms
 from dmcvb_gen.rendering.native.sampling import fill, sample_cube, sample_repeating
 from dmcvb_gen.rendering.native.scene import CAPSULE, CYLINDER, OPAQUE, PLANE, SPHERE
-from dmcvb_gen.rendering.native.visibility import half_length, own_point, through_solid
+from dmcvb_gen.rendering.native.visibility import own_point, through_solid
 
 f4, i4, i8 = np.float32, np.int32, np.int64
 
@@ -207,7 +207,7 @@ def meet_solid(s, n, rec, g, place, turn):
     kind = int(rec[g, L.KIND])
     ox, oy, oz = own_point(rec, g, place, turn, 0.0, 0.0, 0.0)
     deep = f4(0) if kind == CYLINDER else f4(1)
-    a, b, c = 1.0 / half_length(rec, g, 0), 1.0 / half_length(rec, g, 1), 1.0 / half_length(rec, g, 2)
+    a, b, c = 1.0 / rec[g, L.SIZE], 1.0 / rec[g, L.SIZE + 1], 1.0 / rec[g, L.SIZE + 2]
     a1, a2, a3 = f4(rec[g, turn]), f4(rec[g, turn + 3]), f4(rec[g, turn + 6])
     b1, b2, b3 = f4(rec[g, turn + 1]), f4(rec[g, turn + 4]), f4(rec[g, turn + 7])
     c1, c2, c3 = f4(rec[g, turn + 2]), f4(rec[g, turn + 5]), f4(rec[g, turn + 8])

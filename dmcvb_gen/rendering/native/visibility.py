@@ -140,27 +140,19 @@ def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nea
 
 
 @leaf
-def half_length(rec, g, axis):
-    """Half length of a solid along one of its axes, meters; a cylinder's sizes are its radius and its half length."""
-    if rec[g, L.KIND] == CYLINDER:
-        return rec[g, L.SIZE + 1] if axis == 2 else rec[g, L.SIZE]
-    return rec[g, L.SIZE + axis]
-
-
-@leaf
 def own_point(rec, g, place, turn, x, y, z):
     """The camera-frame point (x, y, z) in a solid's own frame, float32."""
     x, y, z = x - rec[g, place], y - rec[g, place + 1], z - rec[g, place + 2]
-    a = (rec[g, turn] * x + rec[g, turn + 3] * y + rec[g, turn + 6] * z) * (1.0 / half_length(rec, g, 0))
-    b = (rec[g, turn + 1] * x + rec[g, turn + 4] * y + rec[g, turn + 7] * z) * (1.0 / half_length(rec, g, 1))
-    c = (rec[g, turn + 2] * x + rec[g, turn + 5] * y + rec[g, turn + 8] * z) * (1.0 / half_length(rec, g, 2))
+    a = (rec[g, turn] * x + rec[g, turn + 3] * y + rec[g, turn + 6] * z) * (1.0 / rec[g, L.SIZE])
+    b = (rec[g, turn + 1] * x + rec[g, turn + 4] * y + rec[g, turn + 7] * z) * (1.0 / rec[g, L.SIZE + 1])
+    c = (rec[g, turn + 2] * x + rec[g, turn + 5] * y + rec[g, turn + 8] * z) * (1.0 / rec[g, L.SIZE + 2])
     return np.float32(a), np.float32(b), np.float32(c)
 
 
 @leaf
 def own_axes(rec, g, turn):
     """The three axes of a solid over their half lengths, nine float32."""
-    f4, a, b, c = np.float32, 1.0 / half_length(rec, g, 0), 1.0 / half_length(rec, g, 1), 1.0 / half_length(rec, g, 2)
+    f4, a, b, c = np.float32, 1.0 / rec[g, L.SIZE], 1.0 / rec[g, L.SIZE + 1], 1.0 / rec[g, L.SIZE + 2]
     ax, ay, az = f4(a * rec[g, turn]), f4(a * rec[g, turn + 3]), f4(a * rec[g, turn + 6])
     bx, by, bz = f4(b * rec[g, turn + 1]), f4(b * rec[g, turn + 4]), f4(b * rec[g, turn + 7])
     cx, cy, cz = f4(c * rec[g, turn + 2]), f4(c * rec[g, turn + 5]), f4(c * rec[g, turn + 8])
