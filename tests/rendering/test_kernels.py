@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native.lighting import aim_shadows, cast_shadows, lamp_on_plane
-from dmcvb_gen.rendering.native.sampling import sample_repeating
+from dmcvb_gen.rendering.native.sampling import sample
 from dmcvb_gen.rendering.native.textures import Textures, levels
 
 SOLIDS = """<mujoco><worldbody><geom type="sphere" size=".3" pos="-.9 .5 0"/>
@@ -25,7 +25,7 @@ def shadowed(s, n, k, rec):
 
 @njit
 def sampled(s, n, texels, width):
-    sample_repeating(s, n, texels, width, 0)
+    sample(s, n, texels, width, 0, True)
 
 
 @njit

@@ -15,7 +15,7 @@ A map for new developers. One frame goes through these kernels (`frame.paint_fra
     shade_jobs                 colors of all jobs, geom by geom, once for each lamp:      shading.py
                                meet_body, meet_solid, meet_plane (points and normals),
                                head_light, lamp_light, cast_shadow, cast_solid_shadow,    lighting.py
-                               sample_repeating, sample_cube, shade_sky                   sampling.py
+                               sample, shade_sky                                         sampling.py
     write_pixels               jobs weighed by their samples                              frame.py
 
 Around them:

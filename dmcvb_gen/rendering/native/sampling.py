@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dmcvb_gen.rendering.native import layout as L
-from dmcvb_gen.rendering.native.layout import distinct, get, get3, leaf, part, put, put3, stage
+from dmcvb_gen.rendering.native.layout import distinct, get, get3, leaf, part, put, put3
 
 f4, i4 = np.float32, np.int32
 SHARE_UNIT = 1.0 / (255.0 * 65536.0 * 256.0)
@@ -105,21 +105,6 @@ def add_level(s, n, texels, at, repeats, many, last, further, weight, slope):
         add_texels(s, i, texels, base, columns, left, right, top, bottom, across, down, share)
 
 
-@stage
-def sample_repeating(s, n, texels, width, texture):
-    """Sample a repeating texture at S, T with FOOTPRINT.
-
-    Args:
-      texels: the table of textures, and the textures; `width` of the table's rows.
-    """
-    at = texture * width
-    last = i4(texels[at + L.LEVELS] - 1)
-    mixed = choose_levels(s, n, last)
-    add_level(s, n, texels, at + L.FIRST, True, i4(0), last, i4(0), f4(256), f4(-1))
-    if mixed:
-        add_level(s, n, texels, at + L.FIRST, True, i4(0), last, i4(1), f4(0), f4(1))
-
-
 @leaf
 def turn_to_face(along_z, along_x, sign, x, y, z):
     """Return a direction's (or its change's) two coordinates and length towards a face of a cube map (OpenGL's table).
@@ -166,12 +151,18 @@ def face_cube(s, n, half):
 
 
 @part
-def sample_cube(s, n, texels, width, texture):
-    """Sample a cube map in a direction with its changes to the right and upwards. See `sample_repeating`."""
+def sample(s, n, texels, width, texture, repeats):
+    """Sample a texture that repeats at S, T with FOOTPRINT, or a cube map in a direction with its changes to the
+    right and upwards.
+
+    Args:
+      texels: the table of textures, and the textures; `width` of the table's rows.
+    """
     at = texture * width
     last, many = i4(texels[at + L.LEVELS] - 1), i4(1 if texels[at + L.FACES] > 1 else 0)
-    face_cube(s, n, f4(0.5) * f4(texels[at + L.FIRST + 1]))
+    if not repeats:
+        face_cube(s, n, f4(0.5) * f4(texels[at + L.FIRST + 1]))
     mixed = choose_levels(s, n, last)
-    add_level(s, n, texels, at + L.FIRST, False, many, last, i4(0), f4(256), f4(-1))
+    add_level(s, n, texels, at + L.FIRST, repeats, many, last, i4(0), f4(256), f4(-1))
     if mixed:
-        add_level(s, n, texels, at + L.FIRST, False, many, last, i4(1), f4(0), f4(1))
+        add_level(s, n, texels, at + L.FIRST, repeats, many, last, i4(1), f4(0), f4(1))

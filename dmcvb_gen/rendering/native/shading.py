@@ -14,7 +14,7 @@ from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.rendering.native import lighting
 from dmcvb_gen.rendering.native.layout import distinct, get, get3, leaf, part, put, put3, stage
 from dmcvb_gen.rendering.native.lighting import terms
-from dmcvb_gen.rendering.native.sampling import fill, sample_cube, sample_repeating
+from dmcvb_gen.rendering.native.sampling import fill, sample
 from dmcvb_gen.rendering.native.scene import CAPSULE, CYLINDER, OPAQUE, PLANE, SPHERE
 from dmcvb_gen.rendering.native.visibility import own_point, through_solid
 
@@ -84,7 +84,7 @@ def shade_plane(s, n, k, rec, texels, width, plane, g, mirrored):
     at = max(texture, 0) * width + L.FIRST
     meet_plane(s, n, rec, g, k[L.STEP], texels[at + 1], texels[at + 2])
     if texture >= 0:
-        sample_repeating(s, n, texels, width, texture)
+        sample(s, n, texels, width, texture, True)
     else:
         for c in range(3):
             fill(s, n, L.TEXEL + c * L.CHUNK, f4(1))
@@ -273,7 +273,7 @@ def cover_ball(s, n, k, rec, texels, width, g):
         turn_rays(s, n, source, f4(right * step), f4(up * step))
         meet(s, n, rec, g, False)
         own_directions(s, n, rec, g, first, less)
-    sample_cube(s, n, texels, width, int(rec[g, L.TEXTURE]))
+    sample(s, n, texels, width, int(rec[g, L.TEXTURE]), False)
 
 
 @stage
@@ -321,7 +321,7 @@ def shade_sky(s, n, k, texels, width):
             put(s, to + i, a * get(s, L.X + i) + b * get(s, L.Y + i) - c)
         fill(s, n, L.RIGHT + axis * L.CHUNK, f4(sign * k[view] * step))
         fill(s, n, L.UP + axis * L.CHUNK, f4(sign * k[view + 1] * step))
-    sample_cube(s, n, texels, width, texture)
+    sample(s, n, texels, width, texture, False)
     for c in range(3):
         for i in range(n):
             put(s, L.BASE + c * L.CHUNK + i, get(s, L.TEXEL + c * L.CHUNK + i))
