@@ -83,7 +83,7 @@ def scene_of(task: Task) -> Scene:
       RenderingError: the model has what this painter does not paint.
     """
     model = task.picture_model
-    geoms, sites, cords = _shown(model.geom_group), _visible_sites(model), _cords(task, model)
+    geoms, sites, cords = _shown(model.geom_group), _shown(model.site_group), _cords(task, model)
     tendons, ends = cords[:, 0], cords[:, 1:]
     material = np.concatenate([model.geom_matid[geoms], model.site_matid[sites], model.tendon_matid[tendons]])
     rgba = np.concatenate([model.geom_rgba[geoms], model.site_rgba[sites], model.tendon_rgba[tendons]])
@@ -190,23 +190,6 @@ def _boxed(model: mujoco.MjModel, geoms: np.ndarray, boxes: np.ndarray) -> np.nd
 
 def _shown(groups: np.ndarray) -> np.ndarray:
     return np.flatnonzero(groups < SHOWN_GROUPS)
-
-
-def _visible_sites(model: mujoco.MjModel) -> np.ndarray:
-    """Sites that MuJoCo shows, but for balls that are wholly inside an opaque capsule or ball of their body."""
-    sites = _shown(model.site_group)
-    hidden = np.zeros(len(sites), bool)
-    for number, site in enumerate(sites.tolist()):
-        for geom in np.flatnonzero(model.geom_bodyid == model.site_bodyid[site]).tolist():
-            if model.geom_type[geom] not in (SPHERE, CAPSULE) or model.geom_group[geom] >= SHOWN_GROUPS:
-                continue
-            axis = np.zeros(3)
-            mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), model.geom_quat[geom])
-            away = model.site_pos[site] - model.geom_pos[geom]
-            half = model.geom_size[geom, 1] if model.geom_type[geom] == CAPSULE else 0.0
-            away = away - np.clip(away @ axis, -half, half) * axis
-            hidden[number] |= np.linalg.norm(away) + model.site_size[site].max() < model.geom_size[geom, 0]
-    return sites[~hidden]
 
 
 def _of_materials(values: np.ndarray, material: np.ndarray) -> np.ndarray:
