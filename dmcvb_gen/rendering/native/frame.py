@@ -365,11 +365,7 @@ def list_jobs(number, behind_number, jobs, color, k, pixels, geoms, first_row, p
     for row in range(first_row, past_row):
         for column in range(int(k[L.CLIP]), int(k[L.CLIP + 1])):
             first = 4 * (row * pixels + column)
-            geom, behind = np.int64(get(number, first)), np.int64(get(behind_number, first))
-            odd = (get(number, first + 1) ^ geom) | (get(number, first + 2) ^ geom) | (get(number, first + 3) ^ geom)
-            odd |= (get(behind_number, first + 1) ^ behind) | (get(behind_number, first + 2) ^ behind)
-            odd |= get(behind_number, first + 3) ^ behind
-            for sample in range(first, first + (1 if odd == 0 else 4)):
+            for sample in range(first, first + 4):
                 share = share_of(number, behind_number, first, sample)
                 if share > 0:
                     geom, behind = np.int64(get(number, sample)), np.int64(get(behind_number, sample))
