@@ -37,6 +37,8 @@ HOLD_OUT = 0.05
 STD_FLOOR = 1e-3
 ENCODED_ROWS = 256
 """Observations that are encoded at a time."""
+AHEAD = 4
+"""Batches that threads draw ahead."""
 
 
 @dataclass(frozen=True)
@@ -133,17 +135,14 @@ def _advise(file: mmap.mmap, use: str, start: int, stop: int) -> None:
         file.madvise(advice, start, stop - start)
 
 
-def normalize_pixels(
-    pictures: torch.Tensor, dtype: torch.dtype = torch.float32, out: torch.Tensor | None = None
-) -> torch.Tensor:
-    """(batch, channel, size, size) uint8 -> [-0.5, 0.5], written over `out` if given; channels lie last in memory.
+def normalize_pixels(pictures: torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    """(batch, channel, size, size) uint8 -> [-0.5, 0.5]; channels lie last in memory.
 
     Convolutions want that layout; otherwise they would convert it forward and backward. In this order bfloat16
     rounds once, as autocast would: 127.5 less is exact in 8 bits.
     """
     turned = pictures.contiguous(memory_format=torch.channels_last)  # while they are bytes
-    values = turned.to(dtype) if out is None else out.copy_(turned)
-    return values.sub_(127.5).mul_(1 / 255)
+    return turned.to(dtype).sub_(127.5).mul_(1 / 255)
 
 
 @dataclass(frozen=True)
@@ -217,17 +216,13 @@ class TrainingData:
         return len(self.train_rows)
 
     def observe(
-        self,
-        rows: torch.Tensor,
-        shift: torch.Tensor | None = None,
-        dtype: torch.dtype = torch.float32,
-        out: torch.Tensor | None = None,
+        self, rows: torch.Tensor, shift: torch.Tensor | None = None, dtype: torch.dtype = torch.float32
     ) -> torch.Tensor:
         """Observations at rows: (batch, channels, size, size) in [-0.5, 0.5], or (batch, state) without pictures.
 
         Args:
           shift: (2, batch) long, offsets of the pictures down and right in 0..2 PAD; None: not shifted.
-          dtype: dtype of pictures. out: memory to write them to, if given.
+          dtype: dtype of pictures.
         """
         if self.frames is None:
             return self.state[rows]
@@ -235,7 +230,7 @@ class TrainingData:
             shift = rows.new_full((2, len(rows)), PAD)
         back = torch.arange(self.stack - 1, -1, -1, device=rows.device)
         stacks = torch.maximum(rows[:, None] - back, self.start[rows][:, None])
-        return normalize_pixels(self.frames.shifted(stacks, shift).to(self.device), dtype, out)
+        return normalize_pixels(self.frames.shifted(stacks, shift).to(self.device), dtype)
 
     def batch(
         self,
@@ -258,7 +253,7 @@ class TrainingData:
           later: the next observation is one step later, and the one k steps later is given besides.
           hold_out: draw from the held-out episodes, without shifts.
           shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
-          options: dtype, reuse and pictures of `transitions`.
+          options: dtype and pictures of `transitions`.
 
         Raises:
           DmcvbError: there are no transitions to draw from.
@@ -284,7 +279,6 @@ class TrainingData:
         steps: torch.Tensor | None = None,
         shift: torch.Tensor | None = None,
         dtype: torch.dtype = torch.float32,
-        reuse: Batch | None = None,
         pictures: bool = True,
         later: bool = False,
     ) -> Batch:
@@ -294,19 +288,16 @@ class TrainingData:
           rows: (batch,) long.
           steps: (batch,) long, how far off the next observation is; None: no next observation.
           shift, dtype: see `observe`. Half the bytes are half the time to write them.
-          reuse: a batch drawn by the same call before and no longer needed: its pictures are written over. Fresh
-            memory for a large batch costs several times the work that fills it.
           pictures: give observations even if the data are encoded.
           later: see `batch`.
         """
         now = following = last = None
         if pictures or self.latent is None:
-            now = self.observe(rows, shift, dtype, reuse and reuse.observation)
+            now = self.observe(rows, shift, dtype)
             if steps is not None:
-                after = rows + (1 if later else steps)
-                following = self.observe(after, shift, dtype, reuse and reuse.next_observation)
+                following = self.observe(rows + (1 if later else steps), shift, dtype)
             if later:
-                last = self.observe(rows + steps, shift, dtype, reuse and reuse.later_observation)
+                last = self.observe(rows + steps, shift, dtype)
         latent = self.latent
         return Batch(
             observation=now,
@@ -355,28 +346,17 @@ class TrainingData:
         return twin
 
 
-def batches(
-    draw: Callable[[int, Batch | None], Batch], steps: int, workers: int = 0, ahead: int = 4
-) -> Iterator[tuple[int, Batch]]:
-    """(step, batch) of each step, in order; drawn ahead by threads if there are workers.
-
-    A batch is to be used before the next one is asked for: without workers its memory is used again.
-
-    Args:
-      draw: gives the batch of a step; told of a batch whose memory it may take.
-    """
+def batches(draw: Callable[[int], Batch], steps: int, workers: int = 0) -> Iterator[tuple[int, Batch]]:
+    """(step, batch) of each step, in order; `AHEAD` are drawn by threads meanwhile if there are workers."""
     if not workers:
-        batch = None
-        for step in range(steps):
-            batch = draw(step, batch)
-            yield step, batch
+        yield from ((step, draw(step)) for step in range(steps))
         return
     with ThreadPoolExecutor(workers) as pool:
-        waiting = {step: pool.submit(draw, step, None) for step in range(min(ahead, steps))}
+        waiting = {step: pool.submit(draw, step) for step in range(min(AHEAD, steps))}
         for step in range(steps):
             batch = waiting.pop(step).result()
-            if step + ahead < steps:
-                waiting[step + ahead] = pool.submit(draw, step + ahead, None)
+            if step + AHEAD < steps:
+                waiting[step + AHEAD] = pool.submit(draw, step + AHEAD)
             yield step, batch
 
 

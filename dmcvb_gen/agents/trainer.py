@@ -116,12 +116,11 @@ def draw(
     step: int,
     hold_out: bool = False,
     shift: bool = True,
-    reuse: Batch | None = None,
 ) -> Batch:
-    """The batch of a step, as the learner needs it; over a batch that is no longer needed, if one is given."""
+    """The batch of a step, as the learner needs it."""
     generator = np.random.default_rng((seed, step, int(hold_out)))
     common: dict[str, Any] = dict(shift=shift, dtype=torch.bfloat16 if learner.half else torch.float32)
-    batch = data.batch(size, generator, hold_out=hold_out, reuse=reuse, **learner.draws, **common)
+    batch = data.batch(size, generator, hold_out=hold_out, **learner.draws, **common)
     if not learner.needs_labels or hold_out:
         return batch
     common |= {"next_observation": True} | learner.draws
@@ -177,8 +176,8 @@ def train(
     seen: dict[str, list[torch.Tensor]] = {}
     started = told_at = time.perf_counter()
 
-    def make(step: int, reuse: Batch | None) -> Batch:
-        return draw(learner, data, size, budget.seed, step, shift=shift, reuse=reuse)
+    def make(step: int) -> Batch:
+        return draw(learner, data, size, budget.seed, step, shift=shift)
 
     groups = [group for optimizer in learner.optimizers.values() for group in optimizer.param_groups]
     rates = [group["lr"] * (budget.rate if pixels else 1.0) for group in groups]

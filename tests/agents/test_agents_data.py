@@ -197,22 +197,10 @@ def test_shares_and_counts_of_episodes_are_taken_once_and_split_by_episode(small
 
 def test_batches_drawn_ahead_come_in_order_and_are_the_same():
     data, learner = make_data(), BehaviorCloning(observation_encoder(9, SIZE), make_data().sizes)
-    plain, ahead = (list(batches(lambda step, _: draw(learner, data, 4, 0, step), 9, workers)) for workers in (0, 2))
+    plain, ahead = (list(batches(lambda step: draw(learner, data, 4, 0, step), 9, workers)) for workers in (0, 2))
     assert [step for step, _ in ahead] == list(range(9))
     for (_, one), (_, two) in zip(plain, ahead, strict=True):
         torch.testing.assert_close(one.observation, two.observation)
-
-
-def test_a_batch_drawn_over_another_one_is_the_same_in_the_same_memory():
-    data = make_data()
-    for dtype in (torch.float32, torch.bfloat16):
-        ask = dict(next_observation=True, dtype=dtype)
-        used = data.batch(16, np.random.default_rng(0), **ask)
-        places = used.observation.data_ptr(), used.next_observation.data_ptr()
-        again, fresh = (data.batch(16, np.random.default_rng(1), reuse=old, **ask) for old in (used, None))
-        assert (again.observation.data_ptr(), again.next_observation.data_ptr()) == places
-        torch.testing.assert_close(again.observation, fresh.observation, atol=0, rtol=0)
-        torch.testing.assert_close(again.next_observation, fresh.next_observation, atol=0, rtol=0)
 
 
 def test_bfloat16_pictures_are_the_float32_ones_rounded_once():
