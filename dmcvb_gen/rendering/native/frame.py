@@ -436,7 +436,7 @@ def shade_geom(scene, scratch, pixels, which, g, mirrored, veil, further):
             if mirrored:
                 swap_with_image(rec, g)
         else:
-            shading.shade_body(s, n, k, rec, scene.texels, scene.width, g, mirrored)
+            shading.shade_body(s, n, k, rec, scene.texels, scene.width, scratch.plane, g, mirrored)
         shading.cover(s, n, k, rec, g, veil, further)
         give_base(s, n, jobs, color, room, at)
 

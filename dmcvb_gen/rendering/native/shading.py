@@ -40,6 +40,23 @@ def aim(s, n, jobs, room, first, pixels, step):
         put(s, L.QUAD_Y + i, (half - f4(quad_row) - f4(0.5)) * step)
 
 
+@part
+def light(s, n, k, rec, plane, g, mirrored):
+    """Compute headlight and lamp (LAMP_COLOR, LIGHT) on geom g, or its mirror image, at points with normals."""
+    exponent, lit = int(rec[g, L.EXPONENT]), not mirrored
+    lighting.head_light(s, n, k, i8(L.MIRRORED if mirrored else L.EYE), exponent)
+    fill(s, n, i8(L.LIGHT), f4(0))
+    if k[L.CONE] > 0.0:
+        if rec[g, L.GRIDDED] > 0.0 and not mirrored:
+            lit = lighting.lamp_on_plane(s, n, k, rec, plane, g)
+        else:
+            lighting.lamp_light(s, n, k, i8(L.MIRRORED + 3 if mirrored else L.LAMP), exponent)
+            lighting.lamp_everywhere(s, n, k, rec, g, exponent)
+        if lit and (rec[g, L.KIND] != PLANE or rec[g, L.OPACITY] >= OPAQUE):
+            lighting.cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
+    lighting.raise_row(s, n, i8(L.HEADLIGHT_SPECULAR), exponent)
+
+
 # -- planes ----------------------------------------------------------------------------------------
 
 
@@ -90,19 +107,7 @@ def shade_plane(s, n, k, rec, texels, width, plane, g, mirrored):
             fill(s, n, L.TEXEL + c * L.CHUNK, f4(1))
     for axis in range(3):
         fill(s, n, L.NORMAL + axis * L.CHUNK, f4(rec[g, L.AXIS + axis]))
-    exponent = int(rec[g, L.EXPONENT])
-    lighting.head_light(s, n, k, i8(L.MIRRORED if mirrored else L.EYE), exponent)
-    fill(s, n, i8(L.LIGHT), f4(0))
-    if k[L.CONE] > 0.0:
-        if rec[g, L.GRIDDED] > 0.0 and not mirrored:
-            lit = lighting.lamp_on_plane(s, n, k, rec, plane, g)
-        else:
-            lighting.lamp_light(s, n, k, i8(L.MIRRORED + 3 if mirrored else L.LAMP), exponent)
-            lighting.lamp_everywhere(s, n, k, rec, g, exponent)
-            lit = not mirrored
-        if lit and rec[g, L.OPACITY] >= OPAQUE:
-            lighting.cast_shadows(s, n, k, rec, g)  # only opaque surfaces show them
-    lighting.raise_row(s, n, i8(L.HEADLIGHT_SPECULAR), exponent)
+    light(s, n, k, rec, plane, g, mirrored)
 
 
 @part
@@ -277,9 +282,8 @@ def cover_ball(s, n, k, rec, texels, width, g):
 
 
 @stage
-def shade_body(s, n, k, rec, texels, width, g, mirrored):
+def shade_body(s, n, k, rec, texels, width, plane, g, mirrored):
     """Compute texture, headlight and lamp on body g, or on its mirror image, along rays."""
-    exponent = int(rec[g, L.EXPONENT])
     turn_rays(s, n, i8(L.X), f4(0), f4(0))
     if rec[g, L.TEXTURE] >= 0.0:
         cover_ball(s, n, k, rec, texels, width, g)
@@ -290,15 +294,7 @@ def shade_body(s, n, k, rec, texels, width, g, mirrored):
         meet(s, n, rec, g, True)
     elif rec[g, L.TEXTURE] < 0.0:
         meet(s, n, rec, g, False)
-    lighting.head_light(s, n, k, i8(L.MIRRORED if mirrored else L.EYE), exponent)
-    if k[L.CONE] > 0.0:
-        lighting.lamp_light(s, n, k, i8(L.MIRRORED + 3 if mirrored else L.LAMP), exponent)
-        if not mirrored:
-            lighting.cast_shadows(s, n, k, rec, g)
-        lighting.lamp_everywhere(s, n, k, rec, g, exponent)
-    else:
-        fill(s, n, i8(L.LIGHT), f4(0))
-    lighting.raise_row(s, n, i8(L.HEADLIGHT_SPECULAR), exponent)
+    light(s, n, k, rec, plane, g, mirrored)
 
 
 # -- sky -------------------------------------------------------------------------------------------
