@@ -656,9 +656,6 @@ def label_frames(scene, frames, scratch, depth, geom):
         clear(inverse, number, k, pixels)
         draw_bodies(inverse, number, scene.rays, k, rec, i8(ALL), i8(L.PLACE), i8(L.AXIS))
         draw_planes(inverse, number, scene.rays, k, rec, True)
-        for row in range(pixels):
-            for column in range(pixels):
-                sample = 4 * (row * pixels + column)
-                sky_there = number[sample] == NOTHING
-                depth[f, row, column] = np.float32(0) if sky_there else np.float32(1) / inverse[sample]
-                geom[f, row, column] = -1 if sky_there else number[sample]
+        firsts = number[::4].copy().reshape(pixels, pixels)
+        depth[f] = np.where(firsts == NOTHING, f4(0), f4(1) / inverse[::4].copy().reshape(pixels, pixels))
+        geom[f] = np.where(firsts == NOTHING, -1, firsts)
