@@ -8,7 +8,7 @@ A map for new developers. One frame goes through these kernels (`frame.paint_fra
     pose_geoms, choose_lamp    records of geoms and lamps, in the camera's frame          frame.py, layout.py
     light_frame                the lamp's light at the floor's vertices, its shadow map   lighting.py
     draw                       the nearest geom of each of four samples a pixel:          visibility.py
-                               draw_capsule (ball, too), draw_solid (cylinder, box,
+                               draw_sphere, draw_capsule, draw_solid (cylinder, box,
                                ellipsoid), draw_plane; mirror images and what is seen
                                through a plane go to a second buffer
     list_jobs                  a job is a surface in a pixel, with its number of samples  frame.py

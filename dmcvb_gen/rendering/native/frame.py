@@ -218,8 +218,10 @@ def draw_bodies(inverse, number, rays, k, rec, which, place, axis):
         geom = np.uint8(g)
         if c0 >= c1 or r0 >= r1:
             continue
-        if rec[g, L.KIND] == SPHERE or rec[g, L.KIND] == CAPSULE:
+        if rec[g, L.KIND] == CAPSULE:
             visibility.draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom)
+        elif rec[g, L.KIND] == SPHERE:
+            visibility.draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom)
         else:
             turn = i8(L.TURN if place == L.PLACE else L.MIRRORED_TURN)
             visibility.draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom)

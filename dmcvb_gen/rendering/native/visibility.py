@@ -83,15 +83,41 @@ def box_of_body(k, rec, g, place, axis, size):
 
 
 @part
-def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom):
-    """Put a ball or capsule into the buffers, in columns c0 to c1 and rows r0 to r1; see `box_of_body`.
+def draw_sphere(inverse, number, rays, c0, c1, r0, r1, rec, g, place, nearest, geom):
+    """Put a ball into the buffers, in columns c0 to c1 and rows r0 to r1.
 
     Args:
+      place: the column of `rec` where its center is.
       nearest: the largest inverse depth drawn.
     """
     distinct()
+    px, py, pz, radius = rec[g, place], rec[g, place + 1], rec[g, place + 2], rec[g, L.SIZE]
+    inside = px * px + py * py + pz * pz - radius * radius
+    if inside <= 0.0:
+        return  # its back faces are not drawn
+    ex, ey, ez = np.float32(px), np.float32(py), np.float32(pz)
+    rr, unit, zero, one = np.float32(radius * radius), np.float32(1.0 / inside), np.float32(0), np.float32(1)
+    limit = np.float32(nearest)
+    size = rays.size // 9
+    for row in range(r0, r1):
+        top, at = rays[8 * size + row], 4 * size * row
+        for i in range(4 * c0, 4 * c1):
+            x, y, before = get(rays, i), top + get(rays, 4 * size + i), get(inverse, at + i)
+            ux, uy, uz = -ey - ez * y, ez * x + ex, ex * y - ey * x
+            square = rr * (one + x * x + y * y) - (ux * ux + uy * uy + uz * uz)
+            along = ex * x + ey * y - ez
+            w = (along + math.sqrt(max(square, zero))) * unit
+            seen = (square > zero) & (along > zero) & (w > before) & (w < limit)
+            put(inverse, at + i, w if seen else before)
+            put(number, at + i, geom if seen else get(number, at + i))
+
+
+@part
+def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nearest, geom):
+    """Put a capsule into the buffers; see `draw_sphere` and `box_of_body`."""
+    distinct()
     zero, one = np.float32(0), np.float32(1)
-    radius, half = rec[g, L.SIZE], rec[g, L.SIZE + 1] if rec[g, L.KIND] == CAPSULE else 0.0
+    radius, half = rec[g, L.SIZE], rec[g, L.SIZE + 1]
     px, py, pz = rec[g, place], rec[g, place + 1], rec[g, place + 2]
     dx, dy, dz = rec[g, axis], rec[g, axis + 1], rec[g, axis + 2]
     ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
@@ -100,15 +126,17 @@ def draw_capsule(inverse, number, rays, c0, c1, r0, r1, rec, g, place, axis, nea
     moment = mx * mx + my * my + mz * mz - radius * radius
     cx, cy, cz = np.float32(mx), np.float32(my), np.float32(mz)
     rr, h, oa, limit = np.float32(radius * radius), np.float32(half), np.float32(along_axis), np.float32(nearest)
-    outside = moment > 0.0 and half > 0.0
+    outside = moment > 0.0
     unit = np.float32(1.0 / moment) if outside else zero
     # The two ends' balls.
     ux, uy, uz = np.float32(px + half * dx), np.float32(py + half * dy), np.float32(pz + half * dz)
     lx, ly, lz = np.float32(px - half * dx), np.float32(py - half * dy), np.float32(pz - half * dz)
     square_of_center = px * px + py * py + pz * pz + half * half - radius * radius
     upper, lower = square_of_center + 2 * half * along_axis, square_of_center - 2 * half * along_axis
-    if upper <= 0.0 or lower <= 0.0 or (not outside and abs(along_axis) < half):
-        return  # the camera is inside; back faces are not drawn
+    if not outside and (abs(along_axis) <= half or min(upper, lower) <= 0.0):
+        return  # the camera is inside
+    if upper <= 0.0 or lower <= 0.0:
+        return
     upper_unit, lower_unit = np.float32(1.0 / upper), np.float32(1.0 / lower)
     toward = along_axis < 0.0  # seen from inside the endless cylinder, the near end is this one
     size = rays.size // 9
@@ -198,7 +226,7 @@ def through_solid(kind, ox, oy, oz, dx, dy, dz):
 
 @part
 def draw_solid(inverse, number, rays, c0, c1, r0, r1, rec, g, place, turn, nearest, geom):
-    """Put a cylinder, box or ellipsoid into the buffers; see `draw_capsule`.
+    """Put a cylinder, box or ellipsoid into the buffers; see `draw_sphere`.
 
     Args:
       turn: the column of `rec` where its axes are.
