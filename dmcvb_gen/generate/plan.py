@@ -103,6 +103,8 @@ def make_plan(
       DmcvbError: anything that would fail later, found before any work.
     """
     store = out if isinstance(out, Store) else open_store(out)
+    if not store.writable:
+        raise store.read_only()
     if store.size(COPY) is not None:
         raise StoreError(f"{store.place} is a copy of a release and does not grow; choose another --out")
     old = read_recipes(store)

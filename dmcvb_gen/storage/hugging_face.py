@@ -123,7 +123,7 @@ class HubStore(Store):
 
     # -- writing ----------------------------------------------------------------------------------
 
-    def _read_only(self) -> StoreError:
+    def read_only(self) -> StoreError:
         return StoreError(
             f"{self.place} takes files in commits; write the release to a folder, then `dmcvb-gen publish` it here"
         )

@@ -87,25 +87,26 @@ class Store(abc.ABC):
 
     def _create(self, path: str, data: bytes | Path) -> None:
         """Write a file as one atomic operation. Raises FileExistsError."""
-        raise self._read_only()
+        raise self.read_only()
 
     def _replace(self, path: str, data: bytes, expected: str | None) -> bool:
         """Write a file in place of version `expected` (None: of nothing, ANY: of all); False if that is not there."""
-        raise self._read_only()
+        raise self.read_only()
 
     def _version(self, path: str) -> str:
         """What names the present content. Raises FileNotFoundError."""
-        raise self._read_only()
+        raise self.read_only()
 
     def _delete(self, path: str) -> None:
         """Remove a file. Raises FileNotFoundError."""
-        raise self._read_only()
+        raise self.read_only()
 
     def _secrets(self) -> Sequence[str]:
         """Strings that no message may show."""
         return ()
 
-    def _read_only(self) -> StoreError:
+    def read_only(self) -> StoreError:
+        """What a place that is not writable answers."""
         return StoreError(f"{self.place} can only be read; give a folder, s3://, gs:// or az://")
 
     # -- reading ----------------------------------------------------------------------------------

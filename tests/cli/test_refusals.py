@@ -79,6 +79,7 @@ OTHERS = [
     ("rollout walker-walk --level", "see `dmcvb-gen rollout --help`"),
     (f"rollout walker-walk --level random --out {'x' * 300}", "is too long for a folder's name"),
     ("rollout walker-walk --level random --out nowhere", "is a link to nothing"),
+    ("rollout walker-walk --level random --out http://127.0.0.1:1/r", "can only be read; give a folder"),
     ("rollout walker-walk --level random --no-pixels --out hole.txt/r", "hole.txt is a file; choose another place"),
     ("info empty", "holds no release"),
     ("info r --option a=1 --option b=2 --json --json", "--option has no effect"),

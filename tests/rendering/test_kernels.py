@@ -45,6 +45,8 @@ def test_shadows_fall_where_mujocos_rays_are_blocked():
     mujoco.mj_forward(solids, data)
     rec, k, rng = np.zeros((solids.ngeom, L.WIDTH)), np.zeros(L.LENGTH), np.random.default_rng(0)
     rec[:, L.KIND], rec[:, L.SIZE : L.SIZE + 3], rec[:, L.BALL] = solids.geom_type, solids.geom_size, 1.0
+    cylinders = solids.geom_type == mujoco.mjtGeom.mjGEOM_CYLINDER
+    rec[cylinders, L.SIZE + 1 : L.SIZE + 3] = solids.geom_size[cylinders, :2]  # along the axes
     rec[:, L.PLACE : L.PLACE + 3], rec[:, L.TURN : L.TURN + 9] = data.geom_xpos, data.geom_xmat
     rec[:, L.AXIS : L.AXIS + 3] = data.geom_xmat[:, 2::3]
     lamp = np.array([0.2, 0.1, 2.5])
