@@ -156,9 +156,9 @@ def _end_interrupted(context: click.Context) -> NoReturn:
 
 
 def _stop_again(lost: sys.UnraisableHookArgs) -> None:
-    """Ctrl-C within a callback of foreign code is lost there, so it comes once more."""
+    """Ctrl-C within a callback of foreign code is lost there, so it comes once more, after that callback."""
     if lost.exc_type is KeyboardInterrupt:
-        _thread.interrupt_main()
+        threading.Timer(0.1, _thread.interrupt_main).start()
 
 
 def _stop_on_signals(context: click.Context) -> None:

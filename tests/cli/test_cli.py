@@ -120,6 +120,29 @@ def test_nothing_that_was_half_begun_prints_a_traceback_when_a_command_is_stoppe
     assert (ended.stdout, ended.stderr.strip()) == ("", "Interrupted.")
 
 
+LOST = """
+import os, signal, time
+from dmcvb_gen.cli import look, main
+
+class Last:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+
+def work(**options):
+    Last()
+    for _ in range(500):
+        time.sleep(0.02)
+
+look.list_command.callback = work
+main(["list"])
+"""
+
+
+def test_ctrl_c_that_a_destructor_swallows_still_ends_the_command():
+    assert python(LOST, code=130).stderr.strip() == "Interrupted."
+
+
 # -- what silence would cost ----------------------------------------------------------------------
 
 
