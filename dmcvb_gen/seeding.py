@@ -24,7 +24,7 @@ DISTRACTOR_STREAMS = tuple(name for name in STREAMS if name not in ("initial_sta
 
 @contextlib.contextmanager
 def generators_kept() -> Iterator[None]:
-    """Leave the caller's own generators of Python, numpy and torch as they were: a training seeds them."""
+    """Put the generators of Python, numpy and torch back as they were. A training seeds them."""
     import torch
 
     python, legacy = random.getstate(), np.random.get_state()

@@ -156,7 +156,7 @@ def _end_interrupted(context: click.Context) -> NoReturn:
 
 
 def _stop_again(lost: sys.UnraisableHookArgs) -> None:
-    """Ctrl-C within a callback of foreign code is lost there, so it comes once more, after that callback."""
+    """Send Ctrl-C again a moment later if Python has dropped it, as it does within a destructor."""
     if lost.exc_type is KeyboardInterrupt:
         threading.Timer(0.1, _thread.interrupt_main).start()
 

@@ -169,7 +169,7 @@ class _Download:
             self.moved += sum(pool.map(self._bring_one, files))
 
     def _record(self, shard: Shard) -> None:
-        """Write the record of a shard whose files are here; its list has said what is in it."""
+        """Write a shard's record after its files. The layer's list says what is in it."""
         if wrong_bytes(self.target, shard.record_file):
             self.target.replace(shard.record_path, canonical_json(shard.record))
             self.moved += 1

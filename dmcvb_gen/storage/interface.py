@@ -106,7 +106,7 @@ class Store(abc.ABC):
         return ()
 
     def read_only(self) -> StoreError:
-        """What a place that is not writable answers."""
+        """The error of a place that cannot be written to."""
         return StoreError(f"{self.place} can only be read; give a folder, s3://, gs:// or az://")
 
     # -- reading ----------------------------------------------------------------------------------

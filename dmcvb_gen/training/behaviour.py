@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Count, Local, Location, Names, Seed, checked
 from dmcvb_gen.parallel import ignore
-from dmcvb_gen.seeding import generators_kept
 from dmcvb_gen.spec import MazeName, task_folder
 from dmcvb_gen.text import as_names
 
@@ -63,7 +62,6 @@ def _one_thread() -> Iterator[None]:
 
 @_one_thread()
 @checked
-@generators_kept()
 def train_behaviour(
     task: Location | None = None,
     *,
@@ -198,6 +196,7 @@ class _Enough(Exception):
 
 def probe(run: "Run") -> float:
     """Seconds an agent step of a run that learns, measured on its own loop in a folder that goes."""
+    from dmcvb_gen.seeding import generators_kept
     from dmcvb_gen.training.run import Run
 
     names = {field.name for field in dataclasses.fields(run.settings)}
@@ -211,7 +210,7 @@ def probe(run: "Run") -> float:
         if began[-1] - began[0] > PROBE_SECONDS:
             raise _Enough
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, generators_kept():
         tried = Run(folder, config)
         tried.tick = tick
         with contextlib.suppress(_Enough):
@@ -223,10 +222,11 @@ def _train(run: "Run", done: int, progress: bool, notify: Callable[[str], None])
     """Train a run under a bar of 80 columns, which shows the last evaluation beside the paper's expert."""
     from dmcvb_gen.policies.paper import paper_returns
     from dmcvb_gen.progress import ProgressBar
+    from dmcvb_gen.seeding import generators_kept
 
     name, expert = task_folder(run.config.task), paper_returns(run.config.task, "expert")
     work: dict[str, Any] = dict(total=run.config.steps, initial=done, smoothing=0, unit=" steps", unit_scale=True)
-    with ProgressBar(progress, **work, desc=name, bar_format=BAR) as bar:
+    with ProgressBar(progress, **work, desc=name, bar_format=BAR) as bar, generators_kept():
         last = time.monotonic()
 
         def tick(steps: int) -> None:
