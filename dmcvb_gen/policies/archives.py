@@ -50,9 +50,14 @@ def bundled_file(name: str) -> Path:
     Raises:
       DmcvbError: it cannot be unpacked, because no folder for it can be written.
     """
-    places = (folder / name for folder in cache_folders())
+    places = (folder / _place(name) for folder in cache_folders())
     sound = (path for path in places if sha256_if_readable(path) == bundled_digests()[name])
     return next(sound, None) or _unpack(name)
+
+
+def _place(name: str) -> Path:
+    """A file's path below a cache folder; versions of this package that bring other policies share that folder."""
+    return Path(bundled_digests()[name][:16]) / name
 
 
 def cache_folders() -> list[Path]:
@@ -71,8 +76,8 @@ def _unpack(name: str) -> Path:
     for folder in cache_folders():
         try:
             for file, content in files.items():
-                write_bytes(folder / file, content)
-            return folder / name
+                write_bytes(folder / _place(file), content)
+            return folder / _place(name)
         except OSError as error:
             reason = error
     raise DmcvbError(

@@ -26,10 +26,23 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache" / "dmcvb-gen" / "policies"
 
 
+@pytest.fixture
+def brings(monkeypatch):
+    """A function that lets the package have the archives of another folder."""
+
+    def change(folder):
+        monkeypatch.setattr(archives, "data_folder", lambda: folder)
+        bundled_digests.cache_clear()
+
+    yield change
+    bundled_digests.cache_clear()
+
+
 @pytest.mark.slow
 def test_every_policy_of_the_list_comes_out_with_its_digest(cache):
     for name, digest in bundled_digests().items():
-        assert bundled_file(name) == cache / name and sha256_file(cache / name) == digest
+        path = cache / digest[:16] / name
+        assert bundled_file(name) == path and sha256_file(path) == digest
 
 
 def test_every_task_has_its_levels_and_its_rows_in_the_docs():
@@ -71,7 +84,7 @@ def policy(seed, scale=1.0):
     return save({"weight": scale * weights, "zeros": zeros, "few": few, "bias": weights[1]}, {"header": "{}"})
 
 
-def test_packed_files_come_out_as_they_were_and_other_tasks_keep_theirs(tmp_path, monkeypatch, cache):
+def test_packed_files_come_out_as_they_were_and_other_tasks_keep_theirs(tmp_path, brings, cache):
     tasks = ("a-task", "ant-maze-x", "ant-maze-y")
     contents = {f"{task}/expert.safetensors": policy(seed, 1.0 + seed) for seed, task in enumerate(tasks)}
     contents["ant-maze-x/medium.safetensors"] = policy(7)
@@ -82,9 +95,17 @@ def test_packed_files_come_out_as_they_were_and_other_tasks_keep_theirs(tmp_path
     pack(swapped, tmp_path)
     assert (tmp_path / "a-task.xz").read_bytes() == before
     del contents["ant-maze-x/medium.safetensors"]  # all that the task had went
-    monkeypatch.setattr(archives, "data_folder", lambda: tmp_path)
-    bundled_digests.cache_clear()
-    try:
-        assert {name: bundled_file(name).read_bytes() for name in bundled_digests()} == contents | swapped
-    finally:
-        bundled_digests.cache_clear()
+    brings(tmp_path)
+    assert {name: bundled_file(name).read_bytes() for name in bundled_digests()} == contents | swapped
+
+
+def test_another_version_of_the_package_leaves_the_unpacked_file_as_it_is(tmp_path, brings, cache):
+    old, new = ({NAME: policy(seed)} for seed in (1, 2))
+    for folder in ("old", "new"):
+        (tmp_path / folder).mkdir()
+    pack(old, tmp_path / "old")
+    brings(tmp_path / "old")
+    in_use = bundled_file(NAME)
+    pack(new, tmp_path / "new")
+    brings(tmp_path / "new")
+    assert bundled_file(NAME).read_bytes() == new[NAME] and in_use.read_bytes() == old[NAME]
