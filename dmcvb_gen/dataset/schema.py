@@ -29,6 +29,7 @@ Rows past L are never written: a missing chunk costs no storage.
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -37,7 +38,9 @@ import numpy as np
 import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec, TransposeCodec, ZstdCodec
 from zarr.core.array import AsyncArray
+from zarr.core.array_spec import ArrayConfig
 from zarr.core.buffer import default_buffer_prototype
+from zarr.core.codec_pipeline import BatchedCodecPipeline
 from zarr.core.metadata.v3 import ArrayV3Metadata
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore, StorePath
@@ -130,13 +133,34 @@ def image_array(
 # -- arrays as Zarr has them ----------------------------------------------------------------------
 
 
+_CONFIG = ArrayConfig(order="C", write_empty_chunks=True)
+"""Zarr leaves the choice of empty chunks to `BoundedZstd`: its own takes longer than the compression."""
+
+
 class BoundedZstd(ZstdCodec):
-    """zstd that decodes no more than a chunk, whatever a frame's header claims; rows that a frame lacks are zero."""
+    """zstd for arrays that are zero by default: it encodes a chunk of zeros as no chunk.
+
+    It decodes no more than a chunk, whatever a frame's header claims; rows that a frame lacks are zero.
+    """
+
+    async def _encode_single(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
+        return await super()._encode_single(chunk_bytes, chunk_spec) if chunk_bytes.as_numpy_array().any() else None
+
+    async def _decode_single(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
+        return await asyncio.to_thread(self._decode_sync, chunk_bytes, chunk_spec)  # which zarr 3.1.3 does not
 
     def _decode_sync(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
         out = np.zeros(math.prod(chunk_spec.shape) * chunk_spec.dtype.item_size, np.uint8)
         self._zstd_codec.decode(chunk_bytes.as_numpy_array(), out)
         return chunk_spec.prototype.buffer.from_array_like(out)
+
+
+class _Sharding(ShardingCodec):
+    """Sharding that hands its codecs many chunks at once; one by one, most of the time goes into asyncio."""
+
+    @property
+    def codec_pipeline(self) -> Any:
+        return BatchedCodecPipeline.from_codecs(self.codecs, batch_size=64)
 
 
 def _filters(codec: Codec) -> tuple[Any, ...]:
@@ -165,7 +189,7 @@ def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> ArrayV3Metad
         steps = min(spec.chunk_steps or rows, rows)
         shape, dims = (episodes, rows, *spec.shape), ("episode", "step", *spec.dims)
         chunks = (per_shard, -(-rows // steps) * steps, *spec.shape)
-        codecs = [ShardingCodec(chunk_shape=(1, steps, *spec.shape), codecs=array_to_bytes)]
+        codecs = [_Sharding(chunk_shape=(1, steps, *spec.shape), codecs=array_to_bytes)]
     return ArrayV3Metadata(
         shape=shape,
         data_type=parse_dtype(np.dtype(spec.dtype), zarr_format=3),
@@ -181,7 +205,7 @@ def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> ArrayV3Metad
 def open_array(layer: Layer, spec: ArraySpec, episodes: int, store: Any) -> zarr.Array:
     """An array over a Zarr store of its chunks, built from its spec; nothing is read."""
     metadata = array_metadata(layer, spec, episodes)
-    return zarr.Array(AsyncArray(metadata=metadata, store_path=StorePath(store)))
+    return zarr.Array(AsyncArray(metadata=metadata, store_path=StorePath(store), config=_CONFIG))
 
 
 def encode(layer: Layer, spec: ArraySpec, values: np.ndarray) -> bytes | None:

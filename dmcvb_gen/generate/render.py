@@ -140,7 +140,7 @@ def paint(
     progress: ProgressCallback = ignore,
     arrays: Collection[str] | None = None,
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Pictures of episodes, one array at a time.
+    """Pictures of episodes, one array at a time; the next one may be written over it.
 
     Args:
       arrays: only these, by name; all of the task's views, with the goal and without it, by default.
@@ -151,10 +151,12 @@ def paint(
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= length[:, None])
     shape = (len(physics), rows, renderer.size, renderer.size, 3)
     names = zip(picture_arrays(task.views), picture_arrays(task.views, hide_goal=True), strict=True)
+    memory = {hides: np.zeros(shape, np.uint8) for hides in (False, True)[: 1 + bool(task.goal_geoms)]}
     for view, (name, hidden_name) in zip(task.views, names, strict=True):
         shown = arrays is None or name in arrays
         hidden = bool(task.goal_geoms) and (arrays is None or hidden_name in arrays)
-        images = {each: np.zeros(shape, np.uint8) for each in [name] * shown + [hidden_name] * hidden}
+        images = {name: memory[False]} if shown else {}
+        images |= {hidden_name: memory[True]} if hidden else {}
         for first in range(0, len(episode) * bool(images), PAINT_FRAMES):
             e, r = (index[first : first + PAINT_FRAMES] for index in (episode, row))
             states, labels = physics[e, r], exogenous[e, r]

@@ -201,7 +201,7 @@ class PaintedSubset(SubsetReader):
         physics, labels = self._drawn_of(episode)
         length, rows = np.array([len(physics) - 1]), self.record.max_steps + 1
         pictures = paint(get_task(self.task), renderer, physics[None], labels[None], length, rows, arrays=arrays)
-        return {name: value[0] for name, value in pictures}
+        return {name: value[0].copy() for name, value in pictures}
 
     @functools.cached_property
     def _painter(self) -> tuple[Renderer, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from google_crc32c import value as crc32c
 from numcodecs.zstd import Zstd
 
 from dmcvb_gen.dataset.gate import Release
@@ -56,7 +57,8 @@ def _with_digests(root: Path, chunk: Path, data: bytes) -> None:
 def _bomb(root: Path) -> None:
     """A chunk of a few bytes that decodes to 512 MB."""
     frame = Zstd(level=19).encode(np.zeros(2**29, np.uint8))
-    _with_digests(root, _chunk(root, "length"), bytes(frame) + b"\0\0\0\0")
+    checked = frame + crc32c(frame).to_bytes(4, "little")
+    _with_digests(root, _chunk(root, "length"), checked)
 
 
 def _replaced(make: Callable[[Path], None], find: Callable[[Path], Path]) -> Callable[[Path], None]:
