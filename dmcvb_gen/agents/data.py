@@ -418,10 +418,11 @@ def load_data(
     """
     subsets = [release[part.subset] for part in slices]
     names = [shown(subset, "agents").arrays if subset.pixel_arrays else () for subset in subsets]
-    alike = {(s.task, s.record.size, s.record.action_repeat, len(n)) for s, n in zip(subsets, names, strict=True)}
+    records = [subset.record for subset in subsets]
+    alike = {(r.task, r.size, r.action_repeat, r.max_steps, len(n)) for r, n in zip(records, names, strict=True)}
     if len(alike) != 1:
         mixed = ", ".join(subset.name for subset in subsets)
-        raise DmcvbError(f"cannot mix {mixed}: tasks, image sizes or action repeats differ")
+        raise DmcvbError(f"cannot mix {mixed}: tasks, image sizes, action repeats or most steps differ")
     if pixels and not names[0]:
         raise DmcvbError(f"{subsets[0].name} has no images that agents are trained on")
     split = [choose_episodes(subset, part, seed) for subset, part in zip(subsets, slices, strict=True)]

@@ -182,7 +182,17 @@ def write_report(folder: Path, facts: dict[str, Any], results: Results) -> Path:
     return page
 
 
+def first_of_each(results: Results) -> Results:
+    """Results without repeated cells; states know of no distractors, so their agents have one cell for all settings."""
+    found: dict[tuple, tuple[Cell, dict[str, Any]]] = {}
+    for cell, result in results:
+        setting = "" if cell.agent.sees_state else cell.setting
+        found.setdefault((cell.benchmark, cell.task, setting, cell.label, cell.policy_label), (cell, result))
+    return list(found.values())
+
+
 def report_facts(
+    data: Release,
     release: Release,
     budget: Budget,
     structure: Structure,
@@ -191,7 +201,11 @@ def report_facts(
     missing: Sequence[Missing],
     warnings: Sequence[Issue],
 ) -> dict[str, Any]:
-    """Everything that the page says, as plain values."""
+    """Everything that the page says, as plain values.
+
+    Args:
+      data: the whole release, which `results` may be of. release: what was asked for of it.
+    """
     failed = [{"cell": cell.id, "error": result["error"]} for cell, result in results if "error" in result]
     asked = {record.name: record.episodes for record in release.manifest.subsets}
     there = asked | {name: have for name, (have, _) in release.shortfalls.items()}
@@ -221,7 +235,7 @@ def report_facts(
         "cells_planned": planned,
         "failed": failed,
         "results": [
-            result | compare(cell, results) | {"score": normalized_score(release, cell, result["score"])}
+            result | compare(cell, results) | {"score": normalized_score(data, cell, result["score"])}
             for cell, result in results
             if "error" not in result
         ],

@@ -84,7 +84,14 @@ def validate(
     from dmcvb_gen.benchmarks.cell import kept_results, open_data, planned_steps, run_cells
     from dmcvb_gen.benchmarks.checks import check_structure, seen_warnings
     from dmcvb_gen.benchmarks.plan import BUDGETS
-    from dmcvb_gen.benchmarks.report import Validation, claim_folder, plan_validation, report_facts, write_report
+    from dmcvb_gen.benchmarks.report import (
+        Validation,
+        claim_folder,
+        first_of_each,
+        plan_validation,
+        report_facts,
+        write_report,
+    )
     from dmcvb_gen.parallel.cores import default_workers, usable_cores
     from dmcvb_gen.precision import choose_precision
     from dmcvb_gen.storage.places import local_path
@@ -114,6 +121,8 @@ def validate(
     )
     data, patterns = open_data(release, budget), as_names(only)
     chosen, cells, missing = plan_validation(data, () if checks_only else as_names(benchmarks), names, patterns)
+    if backgrounds is not None and not any(subset.record.distractor.shows_videos for subset in chosen.subsets.values()):
+        raise DmcvbError("no subset that is validated shows videos, so --backgrounds has no effect: leave it out")
     if patterns:  # a subset that was not asked for is not missing
         asked = [(one, tuple(each for each in one.subsets if matches(each, patterns))) for one in missing]
         missing = [dataclasses.replace(one, subsets=subsets) for one, subsets in asked if subsets]
@@ -130,11 +139,10 @@ def validate(
                 on_score(budget, cell, result)
                 results.append((cell, result))
     results.sort(key=lambda pair: cells.index(pair[0]))
-    known = {cell for cell, _ in results}
-    shown = [*results, *(kept for kept in kept_results(data, folder, budget) if kept[0] not in known)]
+    shown = first_of_each([*results, *kept_results(data, folder, budget)])
     warnings = (*structure.warnings, *seen_warnings(data, [cell for cell, _ in shown], budget.backgrounds))
     planned = dict.fromkeys([*cells, *(cell for cell, _ in shown)])
-    facts = report_facts(chosen, budget, structure, len(planned), shown, missing, warnings)
+    facts = report_facts(data, chosen, budget, structure, len(planned), shown, missing, warnings)
     facts |= {"seconds": time.perf_counter() - started}
     page = write_report(folder, facts, shown)
     return Validation(structure, tuple(results), warnings, facts["complete"], page)

@@ -352,7 +352,8 @@ class Release:
     def __getitem__(self, name: str) -> Any:
         if name not in self.subsets and any(record.name == name for record in self.manifest.subsets):
             raise StoreError(
-                f"{name} belongs to {self.manifest.name}, but {self.place} has no episode of it; make or fetch it first"
+                f"{name} belongs to {self.manifest.name}, but {self.place} has no episode of it; "
+                f"{'fetch' if self.copy else 'make'} it first, or choose others"
             )
         if name not in self.subsets:
             raise UnknownNameError("subset", name, self.subsets)

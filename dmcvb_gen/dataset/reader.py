@@ -14,6 +14,7 @@ from dmcvb_gen.dataset.pictures import picture_of, shown
 from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
+from dmcvb_gen.spec import FIXED
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.zarr_files import ZarrFiles
 from dmcvb_gen.text import quoted
@@ -159,6 +160,11 @@ class Subset:
         """Its layers: trajectories, labels, then images."""
         return tuple(self.release.layers[name] for name in self.record.layers)
 
+    @property
+    def goal_seed(self) -> int | None:
+        """Seed by which fixed goals were drawn; None if the setting has none, or does not say it."""
+        return self.trajectories.makes.get("seed") if self.record.setting == FIXED else None
+
     @functools.cached_property
     def trajectories(self) -> Layer:
         """The layer of its states, actions and rewards."""
@@ -235,6 +241,8 @@ class Subset:
         option = f" --size {size}" if size != known.size else ""
         python = "" if option else " (in Python, dmcvb_gen.open(..., paint=True) renders them as they are read)"
         command = f"dmcvb-gen paint {quoted(self.release.place)}{option}"
+        if self.release.store.folder is None:
+            command = f"dmcvb-gen fetch {quoted(self.release.place)} --paint --out FOLDER"
         return f"{self.name} has episodes without images; add them: `{command}`{python}"
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 from dmcvb_gen.dataset.manifest import SubsetRecord
@@ -12,6 +13,8 @@ from dmcvb_gen.generate.inputs import BUILTIN, shown_videos
 from dmcvb_gen.loaders.envs import DistractedEnv, DistractedVectorEnv
 from dmcvb_gen.spec import FIXED
 from dmcvb_gen.tasks import ACTION_REPEAT
+
+_log = logging.getLogger(__name__)
 
 OF_THE_SETTING = ("backgrounds", "own_videos", "fixed_goals", "goal_seed")
 """Options that mean something under the data's own distractor or goal."""
@@ -64,8 +67,9 @@ def environment_options(subset: Subset, split: str) -> dict[str, Any]:
     if own_videos(subset) and record.distractor.shows_videos and not subset.other_videos:
         options["own_videos"] = (record.backgrounds or {}).get("digest")
     if record.setting == FIXED:
-        seed = int(subset.trajectories.makes.get("seed", 0))
-        options |= {"fixed_goals": record.fixed_goals, "goal_seed": seed}
+        if (seed := subset.goal_seed) is None:
+            _log.warning("%s does not say by which seed its goals were drawn; those of seed 0 are shown", subset.name)
+        options |= {"fixed_goals": record.fixed_goals, "goal_seed": seed or 0}
     return options
 
 

@@ -16,7 +16,7 @@ from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.loaders.arrays import ComputedArray, JoinedArray
 from dmcvb_gen.loaders.release import SubsetReader
 
-ALIKE = ("task", "setting", "size", "views", "hidden_goal", "max_steps", "action_repeat", "renderer", "backgrounds")
+ALIKE = "task setting size views hidden_goal fixed_goals max_steps action_repeat renderer backgrounds".split()
 """Fields of their records in which the parts of a union are equal."""
 
 
@@ -36,6 +36,8 @@ class UnionReader(SubsetReader):
                 if getattr(record, field) != getattr(records[0], field):
                     names = f"{records[0].name} and {record.name}"
                     raise DmcvbError(f"{names} differ in {field}; unite subsets that are alike in it")
+        if len({part.goal_seed for part in parts}) > 1:
+            raise DmcvbError(f"{', '.join(record.name for record in records)} differ in the seed of their goals")
         level = "-".join(record.level for record in records)
         facts = {
             "name": f"{records[0].name.split('/')[0]}/{level}/{records[0].setting}",

@@ -182,8 +182,11 @@ def _summary(release: Release, facts: dict[str, Any]) -> str:
     return text.strip()
 
 
-def header(manifest: Manifest | Resolved, steps: int) -> str:
-    """The YAML header that the Hugging Face Hub reads."""
+def header(manifest: Manifest | Resolved, steps: int, digest: str | None) -> str:
+    """The YAML header that the Hugging Face Hub reads.
+
+    `datasets` knows a local folder's table by its name and this header alone, so the header names the data.
+    """
     category = next((name for limit, name in SIZES if steps < limit), "n>10M")
     facts = {
         "pretty_name": f"{manifest.name} {manifest.version}",
@@ -191,7 +194,7 @@ def header(manifest: Manifest | Resolved, steps: int) -> str:
         "task_categories": ["reinforcement-learning", "robotics"],
         "tags": ["offline-rl", "visual-distractors", "mujoco", "dm-control", "zarr", "croissant", "synthetic"],
         "size_categories": [category],
-        "configs": [CONFIG],
+        "configs": [CONFIG | {"description": f"{steps} steps of {str(digest)[:16]}"}],
     }
     return f"---\n{yaml.safe_dump(facts, sort_keys=False, allow_unicode=True)}---"
 
@@ -207,7 +210,7 @@ def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Seq
         facts=facts,
         summary=summary,
         limits=limits,
-        header=header(manifest, facts["steps"]),
+        header=header(manifest, facts["steps"], release.digest),
         step=_held(manifest),
         arrays=_arrays(release),
         statistics=STATISTICS,

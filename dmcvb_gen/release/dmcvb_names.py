@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from dmcvb_gen.spec import ANT_MAZE, FIXED, HIDDEN, VISIBLE, is_maze
+from dmcvb_gen.spec import ANT_MAZE, FIXED, GOAL_MODES, HIDDEN, VISIBLE, is_maze
 
 _CAMERAS = {
     "top": "lowres_top_camera",
@@ -37,8 +37,8 @@ def state_feature(task: str, field: str) -> str:
 def parse_folder(parts: tuple[str, ...]) -> tuple[str, str, str, int | None] | None:
     """(task, level, setting, seed of fixed goals) of a data set's folder, None if its path does not say it.
 
-    `locomotion/<task>/<level>/<setting>`, `antmaze_random_<visible|hidden>_goal/<layout>/<level>` and
-    `antmaze_fixed_hidden_goal/<layout>/<seed>`.
+    `locomotion/<task>/<level>/<setting>`, `antmaze_random_<visible|hidden>_goal/<layout>/<level>`,
+    `antmaze_fixed_hidden_goal/<layout>/<seed>`, and our own exports' `<task>/<level>/<setting>`.
     """
     if parts and re.fullmatch(r"\d+\.\d+\.\d+", parts[-1]):
         parts = parts[:-1]  # TFDS's folder of the version
@@ -51,4 +51,4 @@ def parse_folder(parts: tuple[str, ...]) -> tuple[str, str, str, int | None] | N
             return (task, "expert", setting, int(third)) if third.isdigit() else None
         return task, third, setting, None
     task = first.replace("_", "-")
-    return (task, second, third, None) if not is_maze(task) else None
+    return (task, second, third, None) if not is_maze(task) or third in GOAL_MODES else None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dmcvb_gen.dataset.gate import Release, Shard, recorded_shards
-from dmcvb_gen.dataset.manifest import MANIFEST, FileRecord, ListedLayer, canonical_json, list_path
+from dmcvb_gen.dataset.manifest import COPY, MANIFEST, FileRecord, ListedLayer, canonical_json, list_path
 from dmcvb_gen.dataset.writer import finish_copy, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
@@ -94,7 +94,7 @@ def _fetch(
             f"{source.place} is not finished; finish it first: dmcvb-gen rollout --out {quoted(source.place)}"
         )
     check_apart(source, target, f"choose another --out, or render its images: dmcvb-gen paint {quoted(source.place)}")
-    there, text = manifest_at(target, source), source.text
+    there, text, was_part = manifest_at(target, source), source.text, target.size(COPY) is not None
     shards = [shard for shard in source.shards(names, episodes) if shard.here]
     if not shards:
         raise StoreError(f"{source.place} has none of these episodes; it has others, see `dmcvb-gen info`")
@@ -107,7 +107,8 @@ def _fetch(
     download.bring_shards(shards)
     download.bring(last)
     for path, data in attachments(source.store) if source.manifest_path == MANIFEST else ():  # they are of the newest
-        if download.repair or there not in (None, text) or target.size(path) is None:
+        newer = there not in (None, text) or (was_part and download.moved)  # a part's card is of that part
+        if download.repair or newer or target.size(path) is None:
             target.replace(path, data)
     finish_copy(target, text, shown(url), [*shards, *kept])
     return Moved(len(files), sum(file.bytes for file in files), download.moved)

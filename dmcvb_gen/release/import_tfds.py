@@ -4,6 +4,7 @@ The published data hold pixels, states, actions and rewards, but neither physics
 imported release can be read, checked and trained on, but not repainted or regenerated. Nothing needs TensorFlow.
 """
 
+import contextlib
 import io
 import re
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ from dmcvb_gen.rendering.base import MAX_SIZE
 from dmcvb_gen.spec import FIXED, LEVELS, SubsetSpec, subset_name
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
-from dmcvb_gen.tasks import get_task
+from dmcvb_gen.tasks import ACTION_REPEAT, get_task
 from dmcvb_gen.tasks.base import Task
 
 ORIGIN = "DMC-VB (Ortiz et al., NeurIPS 2024), TFDS folders"
@@ -66,7 +67,9 @@ class _Source:
             f"{n}/{file.name} {file.stat().st_size}" for n, path in enumerate(self.folders) for file in _files(path)
         ]
         features = sha256_file(self.folders[0] / "features.json")
-        return {"files": len(files), "names": sha256_bytes("\n".join(files).encode()), "features": features}
+        facts = {"files": len(files), "names": sha256_bytes("\n".join(files).encode()), "features": features}
+        seed = _metadata(self.folders[0])[1]
+        return facts if seed is None else facts | {"seed": seed}
 
 
 @checked
@@ -172,6 +175,8 @@ def _identify(path: Path, task, level, setting) -> tuple[str, str, str, int | No
         get_task(task)
         spec = SubsetSpec.parse(task, level, setting)
     except UnknownNameError:
+        if "-" in level and set(level.split("-")) <= set(LEVELS):
+            raise StoreError(f"{path} unites levels; export each of them, and import those") from None
         raise StoreError(
             f"{path} does not say what it is by .../walker_walk/expert/static_medium, "
             ".../antmaze_random_hidden_goal/empty7x7/expert or .../antmaze_fixed_hidden_goal/empty7x7/<seed>; give "
@@ -184,7 +189,8 @@ def _record(
     name: str, facts: tuple[str, str, str], folders: tuple[Path, ...], places: tuple[Place, ...]
 ) -> SubsetRecord:
     task, level, setting = facts
-    hidden, of = SubsetSpec.parse(task, level, setting).hides_goal, get_task(task)
+    repeat, _ = _metadata(folders[0])
+    hidden, of = SubsetSpec.parse(task, level, setting).hides_goal, get_task(task).at(repeat)
     images, sizes = {view: picture_feature(task, view, hidden) for view in of.views}, _image_sizes(folders[0])
     views = tuple(view for view, image in images.items() if image in sizes)
     if not views:
@@ -209,12 +215,22 @@ def _record(
         views=views,
         hidden_goal=hidden,
         max_steps=_time_limit(places, of),
+        action_repeat=repeat,
         seconds_per_step=of.seconds_per_step,
         joints=tuple(of.model.joint(number).name for number in range(of.model.njnt)),
         actuators=tuple(of.model.actuator(number).name for number in range(of.model.nu)),
         fixed_goals=goals if pairs else None,
         episodes_per_goal=len(pairs) // goals if pairs and in_order else None,  # else the episodes' labels say it
     )
+
+
+def _metadata(folder: Path) -> tuple[int, int | None]:
+    """Action repeat, and seed of fixed goals, which our own exports say; DMC-VB's repeat is 2, its seed unknown."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        said = parse_json((folder / "metadata.json").read_bytes())
+        seed = said["seed"] if isinstance(said["seed"], int) and said["seed"] >= 0 else None
+        return (said["action_repeat"] if said["action_repeat"] in (1, 2, 4) else ACTION_REPEAT), seed
+    return ACTION_REPEAT, None
 
 
 def _time_limit(places: tuple[Place, ...], task: Task) -> int:

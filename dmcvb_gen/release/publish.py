@@ -71,7 +71,8 @@ def _publish_release(
     if not release.copy and (lacking := release.unfinished):
         some = pluralize(len(lacking), "subsets")
         _log.warning("%s is not finished: episodes or images of %s stay unpublished, e.g. %s", root, some, min(lacking))
-    if (card := release.store.find(README, MANIFEST_BYTES)) and str(release.digest).encode() not in card:
+    card = release.store.find(README, MANIFEST_BYTES)
+    if card and (str(release.digest).encode() not in card or (b"This is a part of" in card and not release.unfinished)):
         _log.warning("%s/%s is no card of this version; `dmcvb-gen card %s` writes one", root, README, root)
     text, texts = release.text, dict(attachments(release.store))
     store.begin()
@@ -113,9 +114,8 @@ def _publish_release(
 def _check_complete(release: Release, root: str | Path, pixels: bool) -> None:
     """Raises StoreError if something that is to be published is not here, or cannot be left out."""
     if release.in_the_making or (release.copy and not all(s.here for s in release.shards(images=pixels))):
-        raise StoreError(
-            f"{root} is not complete; fetch or render the rest, or finish it with the same rollout, without --only"
-        )
+        cure = "fetch or render the rest" if release.copy else "finish it with the same rollout, without --only"
+        raise StoreError(f"{root} is not complete; {cure}")
     if not pixels and release.manifest.imported:
         raise StoreError(
             f"{root} was imported, and its images cannot be rendered; publish it with them, without --no-pixels"

@@ -189,6 +189,20 @@ def test_the_report_shows_what_lies_in_its_folder(scored, tmp_path):
     assert agents_of(out) == ["state-bc"]
 
 
+def test_results_of_subsets_that_are_not_asked_for_stay_and_states_have_one_for_all_settings(scored, tmp_path):
+    def shown():
+        results = json.loads((out / "report.json").read_text())["results"]
+        return {(one["cell"]["agent"], one["cell"]["setting"]): one["score"] for one in results}
+
+    out = Path(shutil.copytree(scored.first, tmp_path / "out"))
+    before = shown()
+    scored(["state-td3-bc"], out, only="*/*/dynamic")
+    assert shown().keys() == {("state-bc", "none"), ("state-td3-bc", "dynamic")}
+    assert shown()["state-bc", "none"] == before["state-bc", "none"]
+    scored(["state-bc"], out, only="*/*/dynamic")
+    assert shown().keys() == {("state-bc", "dynamic"), ("state-td3-bc", "dynamic")}
+
+
 def test_a_policy_is_not_evaluated_on_other_sizes_and_another_task_is_said(scored, caplog):
     agent = load_agent(scored.first / "cells" / "b1_walker-walk_none_state-bc_random.safetensors")
     with pytest.raises(DmcvbError, match="state has size 17 in cheetah-run, and the policy learned with 24"):
@@ -225,7 +239,7 @@ def test_a_release_that_grows_is_the_same_and_its_cells_are_made_again(scored, t
     assert result["episodes"] == 2
 
 
-def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
+def test_bad_usage_ends_with_2_and_says_what_is_right(release, small_release, tmp_path):
     for arguments, message in (
         ((release, "--profile", "fast"), "paper, quick, smoke"),
         ((release, "--agents", "bcc"), "state-bc"),
@@ -235,6 +249,7 @@ def test_bad_usage_ends_with_2_and_says_what_is_right(release, tmp_path):
         ((release, "--only", "*/expert/*", "--benchmark", "b3"), "let --only take more subsets"),
         ((release, "--checks-only", "--benchmark", "b2"), "--benchmark has no effect"),
         ((release, "--agents", "dino+bc"), "--dino-weights"),
+        ((small_release, "--only", "*/*/none", "--backgrounds", tmp_path), "--backgrounds has no effect"),
         ((tmp_path,), "no release"),
     ):
         result = invoke("validate", *arguments, "--out", tmp_path / "out", code=2)

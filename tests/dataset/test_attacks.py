@@ -89,6 +89,17 @@ def _link_out(path: Path) -> None:
     path.symlink_to(path.parent / "elsewhere")
 
 
+def _altered_list(root: Path) -> None:
+    listed = json.loads(_list_file(root).read_bytes())
+    next(iter(listed["shards"][0]["files"].values()))["sha256"] = "0" * 64
+    _list_file(root).write_bytes(canonical_json(listed))
+
+
+def _copy_without_end(root: Path) -> None:
+    copy = canonical_json(Copy(manifest=sha256_bytes(_manifest_file(root).read_bytes())))
+    (root / "copy.json").write_bytes(copy.replace(b"{}", b'{"hop/none": [[0, 1000000000000000]]}'))
+
+
 ATTACKS: dict[str, Callable[[Path], None]] = {
     "an older format": _rewrite_manifest(lambda m: m.update(schema_version=2)),
     "an unknown codec": _rewrite_manifest(lambda m: m["layers"][0]["arrays"][0].update(codec="pickle")),
@@ -106,15 +117,14 @@ ATTACKS: dict[str, Callable[[Path], None]] = {
     ),
     "a layer that is not described": _rewrite_manifest(lambda m: m["subsets"][0]["layers"].append("hop/none")),
     "another list": _rewrite_manifest(lambda m: m["layers"][0].update(list="0" * 64)),
-    "a copy of shards without end": lambda root: (root / "copy.json").write_bytes(
-        canonical_json(Copy(manifest="0" * 64)).replace(b"{}", b'{"hop/none": [[0, 1000000000000000]]}')
-    ),
+    "a copy of another release": lambda root: (root / "copy.json").write_bytes(canonical_json(Copy(manifest="0" * 64))),
+    "a copy of shards without end": _copy_without_end,
     "deep JSON": lambda root: _manifest_file(root).write_bytes(b"[" * 10**6),
     "a manifest of 64 GB": _replaced(_sparse, _manifest_file),
     "a manifest that is a pipe": _replaced(os.mkfifo, _manifest_file),
     "a manifest that is a link": _replaced(_link_out, _manifest_file),
     "a list of 64 GB": _replaced(_sparse, _list_file),
-    "a list that was altered": lambda root: _list_file(root).write_bytes(_list_file(root).read_bytes() + b" "),
+    "a list that was altered": _altered_list,
     "a chunk that is missing": lambda root: _chunk(root).unlink(),
     "a chunk that is cut": lambda root: _chunk(root).write_bytes(_chunk(root).read_bytes()[:-9]),
     "a chunk that is a pipe": _replaced(os.mkfifo, _chunk),
@@ -122,6 +132,15 @@ ATTACKS: dict[str, Callable[[Path], None]] = {
     "a chunk that is a link": _replaced(_link_out, _chunk),
     "a chunk that decodes to 512 MB": _bomb,
 }
+SAID = {
+    "an unknown codec": r"layers\.0\.arrays\.0\.codec",
+    "an unknown dtype": r"layers\.0\.arrays\.0\.dtype",
+    "a chunk of terabytes": "larger shards than any release has",
+    "a copy of another release": "is a copy of release 0000",
+    "a copy of shards without end": "not runs of numbers|more shards than",
+    "a list that was altered": "was altered",
+}
+"""Words of the refusal, where another check would refuse the attack, too."""
 
 
 def _many_episodes(manifest: dict) -> None:
@@ -161,6 +180,7 @@ def test_an_attack_is_one_line(sound, tmp_path, name):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert "\n" not in str(caught.value) and "\x1b" not in str(caught.value)
+    assert re.search(SAID.get(name, ""), str(caught.value))
     assert peak < 2**28
 
 

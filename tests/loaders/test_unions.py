@@ -10,6 +10,8 @@ import dmcvb_gen
 from dmcvb_gen.benchmarks.report import plan_validation
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
+from dmcvb_gen.release.export import export
+from tests.conftest import roll_out, small_recipe
 from tests.loaders.conftest import FAMILIES
 
 
@@ -78,6 +80,25 @@ def test_an_export_of_a_union_holds_the_episodes_of_both_parts_and_is_not_made_t
     assert json.loads((out / ".dmcvb-gen.json").read_text()) == stamp and stamp["subsets"][0][2] == [0, 1, 2, 3, 4]
     both = dict(only=[parts[0], name], episode_range=(2, 3), progress=False)
     assert len(dmcvb_gen.export(folder, "minari", tmp_path / "minari", **both)) == 2
+
+
+def test_exports_of_equal_names_are_told_apart_by_datasets(levels, tmp_path):
+    datasets = pytest.importorskip("datasets")
+    folder, parts = levels
+    release, union = dmcvb_gen.open(folder), parts[0].replace("random", "random-expert")
+    made = export(str(folder), "lerobot", tmp_path / "out", [*parts, union])
+    tables = [datasets.load_dataset(str(one), split="train", cache_dir=str(tmp_path / "cache")) for one in made]
+    steps = [release["/".join(one.parts[-3:])].read("length").sum() for one in made]
+    assert [len(table) for table in tables] == steps
+
+
+@pytest.mark.parametrize(("other", "field"), [({"fixed_goals": 1}, "fixed_goals"), ({"seed": 1}, "the seed of their goals")])
+def test_fixed_goals_of_other_numbers_or_seeds_are_no_union(other, field, tmp_path):
+    maze = {"tasks": "ant-maze-empty7x7", "settings": ["fixed"], "fixed_goals": 2, "episodes_per_goal": 1}
+    for changes in ({"levels": "expert"}, {"levels": "medium"} | other):
+        roll_out(small_recipe(**maze | {"max_steps": 3, "seed": 0} | changes), tmp_path / "r", pixels=False)
+    with pytest.raises(DmcvbError, match=field):
+        dmcvb_gen.open(tmp_path / "r")["ant-maze-empty7x7/expert-medium/fixed"]
 
 
 def test_validate_takes_both_parts(levels):

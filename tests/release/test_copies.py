@@ -83,7 +83,9 @@ def test_what_an_interrupted_publish_of_an_older_version_left_is_adopted(made, t
 
 def test_a_part_is_a_copy_that_can_be_completed(made, tmp_path):
     url, part, digest, name = f"file:{made}", tmp_path / "part", Release.open(made).digest, "hop/random/none"
+    (made / "README.md").write_text("the card of the whole")
     fetch(url, part, ["*/none"], (2, 3))
+    (part / "README.md").write_text("the card of a part")
     release = Release.open(part, digest=digest)
     assert release.compared and release.copy.promised[f"{name}/pixels"] == ((1, 2),)
     assert release.shortfalls == {"hop/random/dynamic": (0, 3), name: (1, 3)}

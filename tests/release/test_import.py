@@ -18,7 +18,7 @@ from dmcvb_gen.release.export import export
 from dmcvb_gen.release.import_tfds import import_tfds
 from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify
-from tests.conftest import invoke
+from tests.conftest import TINY_MAZE, invoke, roll_out, short_recipe, small_recipe
 
 NAME = "walker-walk/random/static"
 
@@ -181,6 +181,22 @@ def test_pairs_of_fixed_goals_are_those_of_the_folders_or_of_our_exports(dmcvb_m
     [subset] = dmcvb_gen.open(tmp_path / "ours").subsets.values()
     assert subset.read("goal_pair").tolist() == [0, 1]
     assert (subset.record.fixed_goals, subset.record.episodes_per_goal) == (2, 1)
+    assert subset.goal_seed == dmcvb_gen.open(small_mazes)[f"{TINY_MAZE.split(':')[0]}/random/fixed"].goal_seed
+    with pytest.raises(StoreError, match="unites levels; export each of them"):
+        import_tfds(made, tmp_path / "u", task="walker-walk", level="medium-expert", setting="none")
+
+
+@pytest.mark.parametrize("repeat", [1, 4])
+def test_our_own_exports_come_back_with_their_action_repeat(repeat, tmp_path):
+    roll_out(short_recipe(settings="none", episodes=1, action_repeat=repeat), tmp_path / "r")
+    roll_out(small_recipe(tasks="ant-maze-empty7x7", settings=["hidden"], episodes=1, max_steps=3), tmp_path / "m")
+    for made in ("r", "m"):
+        export(str(tmp_path / made), "rlds", tmp_path / "out" / made)
+        import_tfds(tmp_path / "out" / made, tmp_path / "back" / made)
+        [before], [after] = (dmcvb_gen.open(tmp_path / at / made).subsets.values() for at in ("", "back"))
+        for field in ("name", "action_repeat", "seconds_per_step", "setting"):
+            assert getattr(after.record, field) == getattr(before.record, field)
+    assert verify(tmp_path / "back/r").sound
 
 
 def test_folders_that_do_not_say_what_they_are_are_refused(dmcvb_mazes, tmp_path):

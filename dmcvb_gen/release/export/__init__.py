@@ -130,7 +130,8 @@ def _episodes(subset: SubsetReader, asked: tuple[int, int] | None) -> tuple[int,
 def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
     """Write one folder, whole or not at all."""
     release = open_for_reading(work.path, work.storage_options)
-    source = Source(release, release[work.subset], list(work.episodes), tick)
+    digest = sha256_bytes(canonical_json(work.stamp))
+    source = Source(release, release[work.subset], list(work.episodes), tick, digest)
     kind, parent = get_format(work.to), work.folder.parent
     with storage_errors(work.folder, "write to"):
         parent.mkdir(parents=True, exist_ok=True)

@@ -71,6 +71,8 @@ class Source:
     subset: SubsetReader
     episodes: list[int]
     tick: Callable[[int], None]
+    digest: str
+    """Of what its data are made from."""
 
     @property
     def manifest(self) -> Manifest | Resolved:

@@ -95,9 +95,10 @@ def _card(layout: _Layout) -> str:
     rate = ""
     if layout.fps != layout.rate:
         rate = f"\nThe task takes {layout.rate:.4g} steps a second; timestamps have {layout.fps}, a whole number.\n"
+    # `datasets` knows the data of a local folder by its name and this header alone, so the header names the data.
     return (
         f"---\nlicense: {manifest.license.lower()}\ntask_categories:\n- robotics\ntags:\n- LeRobot\nconfigs:\n"
-        "- config_name: default\n  data_files: data/*/*.parquet\n---\n\n"
+        f"- config_name: default\n  description: {layout.source.digest}\n  data_files: data/*/*.parquet\n---\n\n"
         f"# {manifest.name} {manifest.version}\n\nA LeRobot data set ({VERSION}): {layout.source.description}.\n{rate}"
     )
 

@@ -60,7 +60,12 @@ def write(source: Source, folder: Path) -> None:
     }
     (target / "dataset_info.json").write_text(json.dumps(info, indent=1))
     (target / "features.json").write_text(json.dumps(_features(source), indent=1))
-    (target / "metadata.json").write_text(json.dumps(source.names | {"joints": source.joints}, indent=1))
+    facts = {
+        "joints": source.joints,
+        "action_repeat": source.subset.record.action_repeat,
+        "seed": source.subset.goal_seed,
+    }
+    (target / "metadata.json").write_text(json.dumps(source.names | facts, indent=1))
 
 
 # -- what the features are ------------------------------------------------------------------------
