@@ -100,6 +100,22 @@ def _copy_without_end(root: Path) -> None:
     (root / "copy.json").write_bytes(copy.replace(b"{}", b'{"hop/none": [[0, 1000000000000000]]}'))
 
 
+FILE = {"bytes": 1, "sha256": "0" * 64}
+
+
+def _with_list(change: Callable[[dict], None]) -> Callable[[Path], None]:
+    """Change the first layer's list, and the manifest accordingly."""
+
+    def attack(root: Path) -> None:
+        listed = json.loads(_list_file(root).read_bytes())
+        change(listed)
+        text = canonical_json(listed)
+        (root / f"layers/{sha256_bytes(text)}.json").write_bytes(text)
+        _rewrite_manifest(lambda m: m["layers"][0].update(list=sha256_bytes(text)))(root)
+
+    return attack
+
+
 ATTACKS: dict[str, Callable[[Path], None]] = {
     "an older format": _rewrite_manifest(lambda m: m.update(schema_version=2)),
     "an unknown codec": _rewrite_manifest(lambda m: m["layers"][0]["arrays"][0].update(codec="pickle")),
@@ -125,6 +141,10 @@ ATTACKS: dict[str, Callable[[Path], None]] = {
     "a manifest that is a link": _replaced(_link_out, _manifest_file),
     "a list of 64 GB": _replaced(_sparse, _list_file),
     "a list that was altered": _altered_list,
+    "a list that is short": _with_list(lambda listed: listed["shards"].pop()),
+    "an array of no layer": _with_list(
+        lambda listed: listed["shards"][0]["files"].update(x={"bytes": 1, "sha256": "0" * 64})
+    ),
     "a chunk that is missing": lambda root: _chunk(root).unlink(),
     "a chunk that is cut": lambda root: _chunk(root).write_bytes(_chunk(root).read_bytes()[:-9]),
     "a chunk that is a pipe": _replaced(os.mkfifo, _chunk),
@@ -139,6 +159,8 @@ SAID = {
     "a copy of another release": "is a copy of release 0000",
     "a copy of shards without end": "not runs of numbers|more shards than",
     "a list that was altered": "was altered",
+    "a list that is short": "lists 1 shards, and the manifest says 2",
+    "an array of no layer": "names array",
 }
 """Words of the refusal, where another check would refuse the attack, too."""
 

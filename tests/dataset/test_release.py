@@ -181,6 +181,12 @@ def test_a_folder_of_something_else_is_no_place_for_a_release(store):
         begin(store, made_up.recipe(2), {})
 
 
+def test_a_release_is_no_place_for_another(store):
+    made_up.make(store, made_up.recipe(2))
+    with pytest.raises(StoreError, match="lies in the release .*; choose another --out"):
+        begin(open_store(store.folder / "inner"), made_up.recipe(2), {})
+
+
 def test_what_is_no_note_of_provenance_is_left_out(store):
     write_provenance(store, "test")
     for name, junk in {"0": b"garbage", "1": b"[]", "9": b'{"environment":{"cpu":["a"]}}'}.items():

@@ -12,6 +12,7 @@ import functools
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -36,6 +37,7 @@ from PIL import Image
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.distractors.backgrounds import load_backgrounds
 from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.generate.plan import make_plan
 from dmcvb_gen.generate.recipe import expand, load_recipe
 from dmcvb_gen.policies.bundled import resolve_policies
@@ -324,12 +326,27 @@ class Kind:
     base: Callable[[], Files] = dict
 
 
+def _sealed(name: str, data: bytes) -> Files:
+    """A changed file with the files that name it changed accordingly, as the author of a release can do."""
+    folder, old, new = name.split("/")[0], sha256_bytes(valid_release()[name]).encode(), sha256_bytes(data)
+    if folder == "recipes":
+        return {f"recipes/{new}.json": data}
+    if folder == "layers":
+        named = valid_release()["manifest.json"].replace(old, new.encode())
+        return {f"layers/{new}.json": data, "manifest.json": named}
+    for path, text in valid_release().items():
+        if path.startswith("layers/") and old in text:
+            facts = re.compile(rb'"bytes":\d+,"sha256":"' + old)
+            return {name: data} | _sealed(path, facts.sub(b'"bytes":%d,"sha256":"%s' % (len(data), new.encode()), text))
+    return {name: data}
+
+
 def _one_of_release(start: str, inside: str = "") -> Callable[[], st.SearchStrategy[Files]]:
     """Cases of one changed file of a release, whose path begins so and has that in it."""
 
     def changed(name: str) -> st.SearchStrategy[Files]:
         change = changed_json if name.endswith(".json") else changed_bytes
-        return change(valid_release()[name]).map(lambda data: {name: data})
+        return change(valid_release()[name]).map(lambda data: _sealed(name, data))
 
     def cases() -> st.SearchStrategy[Files]:
         return st.one_of([changed(name) for name in valid_release() if name.startswith(start) and inside in name])
@@ -337,8 +354,8 @@ def _one_of_release(start: str, inside: str = "") -> Callable[[], st.SearchStrat
     return cases
 
 
-def _unfinished() -> Files:
-    return {name: data for name, data in valid_release().items() if name != "manifest.json"}
+def _unfinished(without: str = "manifest.json") -> Files:
+    return {name: data for name, data in valid_release().items() if not name.startswith(("manifest.json", without))}
 
 
 def _recipes() -> st.SearchStrategy[Files]:
@@ -350,7 +367,7 @@ KINDS: dict[str, Kind] = {
     "manifest": Kind(_one_of_release("manifest.json"), take_release, valid_release),
     "list": Kind(_one_of_release("layers/"), take_release, valid_release),
     "record": Kind(_one_of_release("records/"), take_release, _unfinished),
-    "resolved": Kind(_one_of_release("recipes/"), take_release, _unfinished),
+    "resolved": Kind(_one_of_release("recipes/"), take_release, lambda: _unfinished("recipes/")),
     "chunk": Kind(_one_of_release("hop/", "/c/"), take_release, valid_release),
     "recipe": Kind(_recipes, take_recipe, lambda: {"recipe.yaml": json.dumps(RECIPE).encode()}),
     "policy": Kind(changed_policy, take_policy, valid_policy),

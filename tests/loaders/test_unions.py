@@ -92,7 +92,9 @@ def test_exports_of_equal_names_are_told_apart_by_datasets(levels, tmp_path):
     assert [len(table) for table in tables] == steps
 
 
-@pytest.mark.parametrize(("other", "field"), [({"fixed_goals": 1}, "fixed_goals"), ({"seed": 1}, "the seed of their goals")])
+@pytest.mark.parametrize(
+    ("other", "field"), [({"fixed_goals": 1}, "fixed_goals"), ({"seed": 1}, "the seed of their goals")]
+)
 def test_fixed_goals_of_other_numbers_or_seeds_are_no_union(other, field, tmp_path):
     maze = {"tasks": "ant-maze-empty7x7", "settings": ["fixed"], "fixed_goals": 2, "episodes_per_goal": 1}
     for changes in ({"levels": "expert"}, {"levels": "medium"} | other):

@@ -94,6 +94,8 @@ def test_a_part_is_a_copy_that_can_be_completed(made, tmp_path):
     with pytest.raises(StoreError, match="has 2..2 here"):
         release[name].array("state")[:]
     assert finish(open_store(part)).digest == digest
+    with pytest.raises(StoreError, match="is a copy of a release and does not grow"):
+        begin(open_store(part), recipe(3, ["static"]), {})
     with pytest.raises(StoreError, match="is not complete"):
         publish(part, f"file:{tmp_path / 'x'}")
     fetch(url, part)
@@ -132,6 +134,10 @@ def test_a_grown_release_takes_the_place_of_the_older(made, place, tmp_path):
     for replaced in (Release.open(url, *options.values(), digest=old), Release.open(back, digest=old)):
         assert replaced.compared and len(replaced["hop/random/none"].read("state")) == 3
     assert verify(f"{url}@sha256:{old}", everything=True, **options).sound
+    older = back / f"manifests/{old}.json"
+    older.write_bytes(older.read_bytes().replace(b"1.0.0", b"1.0.9"))
+    with pytest.raises(StoreError, match="was altered"):
+        Release.open(back, digest=old)
     with pytest.raises(StoreError, match="already holds hop 1.0.0"):
         publish(tmp_path / "old", url, **options)
     with pytest.raises(StoreError, match="and not hop 1.0.0"):

@@ -100,7 +100,8 @@ def test_damaged_or_foreign_folders_are_not_imported(rlds, tmp_path):
     [path] = (tmp_path / "somewhere").rglob("*.tfrecord-*")
     data = path.read_bytes()
     what = dict(task="walker-walk", level="random", setting="static")
-    for damaged in (data[:-100], data[:5000] + b"x" + data[5001:], b"not records at all"):
+    in_its_length = data[:8] + bytes([data[8] ^ 1]) + data[9:]  # the checksum of it
+    for damaged in (data[:-100], data[:5000] + b"x" + data[5001:], b"not records at all", in_its_length):
         path.write_bytes(damaged)
         with pytest.raises(StoreError, match="damaged"):
             import_tfds(tmp_path / "somewhere", tmp_path / "r", **what)

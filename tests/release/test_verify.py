@@ -53,6 +53,11 @@ def duplicate(arrays):
         arrays[name][2] = arrays[name][0]
 
 
+def enrich(arrays):
+    arrays["return"][1] += 2000 - arrays["reward"][1, 3]
+    arrays["reward"][1, 3] = 2000
+
+
 def put(name, place, value):
     """A change of one number."""
     return lambda arrays: arrays[name].__setitem__(place, value)
@@ -66,6 +71,10 @@ DAMAGE = {
     "an episode twice": (duplicate, {"duplicates", 2}),
     "a wild action": (put("action", (1, 7, 0), 1.5), {"actions", 1, 7}),
     "no length": (put("length", 1, 0), {"lengths", 1}),
+    "an end that was none": (put("terminated", 1, True), {"lengths", 1}),
+    "another state": (put("state", (0, 0, 3), 9.0), {"states", 0}),
+    "a leap": (put("physics", (0, 1, 4), 9.0), {"physics", 0}),
+    "a return that no episode has": (enrich, {"returns", 1}),
 }
 """Damage to the arrays, the check that finds it, the episode, and the step if it is known."""
 
