@@ -39,7 +39,7 @@ from dmcvb_gen.agents.paper import Autoencoder, StateProbe
 from dmcvb_gen.agents.probe import action_probe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
 from dmcvb_gen.benchmarks.evaluate import SPLIT, Evaluator, Score, TrainedAgent, evaluation_steps, renderer_choice
-from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, goal_cells
+from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, Results, goal_cells
 from dmcvb_gen.dataset import Release, Subset
 from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.distractors import load_backgrounds
@@ -136,9 +136,12 @@ def read_result(path: Path, wanted: str) -> dict[str, Any] | None:
     return None
 
 
-def kept_results(release: Release, out: str | Path, budget: Budget) -> list[tuple[Cell, dict[str, Any]]]:
-    """The results in a report's folder whose fingerprint is that of their cell on this release, by this budget."""
-    found = []
+def with_kept(made: Results, release: Release, out: str | Path, budget: Budget) -> Results:
+    """Results, and those in a report's folder whose fingerprint is that of their cell on this release, by this budget.
+
+    The first of a cell counts. States know of no distractors, so an agent that sees them has one cell for all settings.
+    """
+    found = list(made)
     for path in sorted((Path(out) / "cells").glob("*.json")):
         with contextlib.suppress(DmcvbError, OSError, ValueError, LookupError, TypeError, AttributeError):
             result = json.loads(path.read_text())
@@ -146,7 +149,11 @@ def kept_results(release: Release, out: str | Path, budget: Budget) -> list[tupl
             BENCHMARKS.get(cell.benchmark)
             if result["fingerprint"] == fingerprint(release, budget, cell):
                 found.append((cell, result))
-    return found
+    first: dict[tuple, tuple[Cell, dict[str, Any]]] = {}
+    for cell, result in found:
+        setting = "" if cell.agent.sees_state else cell.setting
+        first.setdefault((cell.benchmark, cell.task, setting, cell.label, cell.policy_label), (cell, result))
+    return list(first.values())
 
 
 # -- one cell ---------------------------------------------------------------------------------------

@@ -38,8 +38,6 @@ PICTURE_EPISODES = 100
 """Episodes of a subset whose every frame is looked at."""
 PAINTED_EPISODES = 8
 """The same, where its pictures are painted to be looked at."""
-Results = Sequence[tuple[Cell, dict[str, Any]]]
-"""Cells with their results."""
 
 
 @dataclass(frozen=True)

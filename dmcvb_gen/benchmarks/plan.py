@@ -171,6 +171,10 @@ class Cell:
         return cls(agent=parse_agent(facts["agent"]), **places, **parts)
 
 
+Results = Sequence[tuple[Cell, dict[str, Any]]]
+"""Cells with their results."""
+
+
 @dataclass(frozen=True)
 class Missing:
     """Subsets that a benchmark needs of a task and does not find."""

@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.trainer import Budget
-from dmcvb_gen.benchmarks.checks import Results, Structure, comparable, known_returns, normalized_score
-from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, only, paper_score, plan_benchmark
+from dmcvb_gen.benchmarks.checks import Structure, comparable, known_returns, normalized_score
+from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, Results, only, paper_score, plan_benchmark
 from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.environment import environment
 from dmcvb_gen.errors import DmcvbError
@@ -180,15 +180,6 @@ def write_report(folder: Path, facts: dict[str, Any], results: Results) -> Path:
         write_json(page.with_suffix(".json"), facts)
         write_text(page, render_page(facts, good, folder))
     return page
-
-
-def first_of_each(results: Results) -> Results:
-    """Results without repeated cells; states know of no distractors, so their agents have one cell for all settings."""
-    found: dict[tuple, tuple[Cell, dict[str, Any]]] = {}
-    for cell, result in results:
-        setting = "" if cell.agent.sees_state else cell.setting
-        found.setdefault((cell.benchmark, cell.task, setting, cell.label, cell.policy_label), (cell, result))
-    return list(found.values())
 
 
 def report_facts(

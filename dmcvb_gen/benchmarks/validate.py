@@ -81,17 +81,10 @@ def validate(
     asked = {name: value for name, value in locals().items() if name in TRAINING}
     import torch
 
-    from dmcvb_gen.benchmarks.cell import kept_results, open_data, planned_steps, run_cells
+    from dmcvb_gen.benchmarks.cell import open_data, planned_steps, run_cells, with_kept
     from dmcvb_gen.benchmarks.checks import check_structure, seen_warnings
     from dmcvb_gen.benchmarks.plan import BUDGETS
-    from dmcvb_gen.benchmarks.report import (
-        Validation,
-        claim_folder,
-        first_of_each,
-        plan_validation,
-        report_facts,
-        write_report,
-    )
+    from dmcvb_gen.benchmarks.report import Validation, claim_folder, plan_validation, report_facts, write_report
     from dmcvb_gen.parallel.cores import default_workers, usable_cores
     from dmcvb_gen.precision import choose_precision
     from dmcvb_gen.storage.places import local_path
@@ -139,7 +132,7 @@ def validate(
                 on_score(budget, cell, result)
                 results.append((cell, result))
     results.sort(key=lambda pair: cells.index(pair[0]))
-    shown = first_of_each([*results, *kept_results(data, folder, budget)])
+    shown = with_kept(results, data, folder, budget)
     warnings = (*structure.warnings, *seen_warnings(data, [cell for cell, _ in shown], budget.backgrounds))
     planned = dict.fromkeys([*cells, *(cell for cell, _ in shown)])
     facts = report_facts(data, chosen, budget, structure, len(planned), shown, missing, warnings)
