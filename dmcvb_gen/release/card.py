@@ -171,7 +171,7 @@ def _summary(release: Release, facts: dict[str, Any]) -> str:
         held = "states, full physics states and the labels of every visual distractor, from which `dmcvb-gen paint` "
         held += "makes the pictures"
     text = (
-        f"{manifest.description}\n\nOffline-RL episodes of {tasks} with {held}: "
+        f"{manifest.description} Offline-RL episodes of {tasks} with {held}: "
         f"{pluralize(len(facts['subsets']), 'subsets')}, "
         f"{pluralize(sum(subset['episodes'] for subset in facts['subsets']), 'episodes')}, {facts['steps']:,} steps."
     )
