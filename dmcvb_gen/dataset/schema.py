@@ -147,7 +147,7 @@ class BoundedZstd(ZstdCodec):
         return await super()._encode_single(chunk_bytes, chunk_spec) if chunk_bytes.as_numpy_array().any() else None
 
     async def _decode_single(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
-        return await asyncio.to_thread(self._decode_sync, chunk_bytes, chunk_spec)  # which zarr 3.1.3 does not
+        return await asyncio.to_thread(self._decode_sync, chunk_bytes, chunk_spec)  # which zarr before 3.1.6 does not
 
     def _decode_sync(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
         out = np.zeros(math.prod(chunk_spec.shape) * chunk_spec.dtype.item_size, np.uint8)
