@@ -72,7 +72,7 @@ class Source:
     episodes: list[int]
     tick: Callable[[int], None]
     digest: str
-    """Of what its data are made from."""
+    """SHA-256 of the export's stamp, which names the shards that it reads."""
 
     @property
     def manifest(self) -> Manifest | Resolved:

@@ -60,11 +60,8 @@ def write(source: Source, folder: Path) -> None:
     }
     (target / "dataset_info.json").write_text(json.dumps(info, indent=1))
     (target / "features.json").write_text(json.dumps(_features(source), indent=1))
-    facts = {
-        "joints": source.joints,
-        "action_repeat": source.subset.record.action_repeat,
-        "seed": source.subset.goal_seed,
-    }
+    held, seed = source.subset.record.action_repeat, source.subset.goal_seed
+    facts = {"joints": source.joints, "action_repeat": held, "seed": seed}
     (target / "metadata.json").write_text(json.dumps(source.names | facts, indent=1))
 
 
