@@ -82,9 +82,9 @@ TINY_MAZE = "ant-maze-tiny:****/*..*/****"
 
 
 def maze_recipe(settings=("visible",), **changes):
-    """A maze of two cells, random actions, 2 episodes in shards of 1, small pictures."""
+    """A maze of two cells, random actions, 2 episodes (the second finds the goal) in shards of 1, small pictures."""
     maze = {"tasks": TINY_MAZE, "settings": list(settings), "episodes": 2, "episodes_per_shard": 1}
-    return small_recipe(**({"name": "mazes", "seed": 0} | maze | changes))
+    return small_recipe(**({"name": "mazes", "seed": 5} | maze | changes))
 
 
 @pytest.fixture(scope="session")

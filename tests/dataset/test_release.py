@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dmcvb_gen.dataset import gate, writer
 from dmcvb_gen.dataset.gate import Release
-from dmcvb_gen.dataset.manifest import ShardRecord, canonical_json, record_path, shard_size
+from dmcvb_gen.dataset.manifest import COPY, ShardRecord, canonical_json, record_path, shard_size
 from dmcvb_gen.dataset.writer import (
     begin,
     finish,
@@ -128,6 +129,29 @@ def test_growths_in_any_order_give_one_manifest_and_asking_for_less_changes_none
     for index in order:
         release = made_up.make(store, GROWTHS[index])
     assert release.digest == largest.digest and len(release.manifest.recipes) == 1
+
+
+def test_a_manifest_that_another_process_finished_meanwhile_is_not_replaced(store, monkeypatch):
+    build = writer.build_manifest
+
+    def overtaken(*known):
+        monkeypatch.undo()
+        made_up.make(store, made_up.recipe(5))
+        return build(*known)
+
+    made_up.make(store, made_up.recipe(2))
+    monkeypatch.setattr(writer, "build_manifest", overtaken)
+    assert len(made_up.make(store, made_up.recipe(3))[NAME]) == len(Release.open(store)[NAME]) == 5
+
+
+@pytest.mark.parametrize("bound", ["MANIFEST_BYTES", "RECIPE_BYTES", "COPY_BYTES"])
+def test_what_is_parsed_is_bounded(store, monkeypatch, bound):
+    made_up.make(store, made_up.recipe(2))
+    store.create(COPY, b"{}")
+    monkeypatch.setattr(gate, bound, 1)
+    with pytest.raises(StoreError, match="larger than the 1 bytes"):
+        gate.read_recipes(store)
+        Release.open(store)
 
 
 REFUSED = {

@@ -93,6 +93,14 @@ def test_what_is_no_folder_of_videos_of_a_split_is_named(tmp_path):
             load_backgrounds(tmp_path / name, split)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".mp4"])
+def test_a_file_of_more_pixels_than_anybody_films_is_not_decoded(tmp_path, monkeypatch, suffix):
+    iio.imwrite(tmp_path / f"a{suffix}", clip(1, 128, 128)[0 if suffix == ".png" else slice(None)])
+    monkeypatch.setattr(backgrounds_module, "MAX_PIXELS", 127 * 128)
+    with pytest.raises(BackgroundError, match="16,256 pixels|size 128x128"):
+        load_backgrounds(tmp_path)
+
+
 @pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv", ".gif", ".webp", ".png", ".jpg"])
 @pytest.mark.parametrize("share", [0.5, 0.9, None])
 def test_a_truncated_or_unreadable_file_is_named_instead_of_giving_fewer_frames(tmp_path, suffix, share):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.reader import TRANSITIONS
 from dmcvb_gen.distractors import DistractorSetting, sample_distractors
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import fixed_pairs
@@ -25,6 +26,17 @@ def test_all_views_with_and_without_the_goal(maze_release):
     if episode["terminated"]:
         assert episode["discount"][-1] == 0 and episode["state"][-1, task.state_slices["target_activated"]] == 1
     assert (episode["reward"] <= 0).all() and (episode["reward"] >= -2).all()
+
+
+@pytest.mark.slow
+def test_rows_past_an_episodes_end_are_zero(tmp_path):
+    subset = roll_out(maze_recipe(episodes_per_shard=2), tmp_path / "r")["ant-maze-tiny/random/visible"]
+    lengths = subset.read("length")
+    assert lengths.min() < lengths.max() and subset.read("exogenous/style")[:, 0].all()
+    for name in subset.arrays:
+        if subset.spec(name).steps:
+            for values, length in zip(subset.array(name)[:], lengths, strict=True):
+                assert not values[length + (name not in TRANSITIONS) :].any(), name
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from dmcvb_gen.dataset.writer import begin, finish, put_shard
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes
 from dmcvb_gen.release import fetch as fetching
+from dmcvb_gen.release import publish as publishing
 from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.publish import publish
 from dmcvb_gen.release.verify import verify
@@ -69,6 +70,19 @@ def test_a_release_comes_back_as_it_went(made, place, tmp_path):
     assert found.sound and found.complete and found.compared and found.digest == digest
     with pytest.raises(StoreError, match=f"is release {digest}, not 0000"):
         fetch(f"{url}@sha256:{'0' * 64}", tmp_path / "x", **options)
+
+
+def test_of_two_who_publish_at_once_one_does(made, place, monkeypatch):
+    (url, options), metadata = place, publishing.plain_metadata
+
+    def overtaken(release):
+        assert open_store(url, *options.values()).finish({MANIFEST: b"of another"})
+        return metadata(release)
+
+    monkeypatch.setattr(publishing, "plain_metadata", overtaken)
+    with pytest.raises(StoreError, match="was published to by another process meanwhile; run the command again"):
+        publish(made, url, **options)
+    assert content(url, **options)[MANIFEST] == b"of another"
 
 
 def test_what_an_interrupted_publish_of_an_older_version_left_is_adopted(made, tmp_path):
