@@ -28,7 +28,7 @@ from dmcvb_gen.generate.preview import contact_sheet
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.options import Local, Location, checked
 from dmcvb_gen.policies.header import OWN_CODE, origin_of
-from dmcvb_gen.release.croissant import HOME, Publication, croissant, derived_from, generator, groups, page_of
+from dmcvb_gen.release.croissant import CITATION, HOME, croissant, derived_from, generator, groups, page_of
 from dmcvb_gen.release.episode_table import CONFIG, TABLE, table_rows, write_table
 from dmcvb_gen.release.templates import fill
 from dmcvb_gen.spec import ALL_PARTS, CUE, DISTRACTOR_KINDS, DistractorSetting
@@ -41,14 +41,6 @@ README, CROISSANT = "README.md", "croissant.json"
 SHEET = f"{CARD_FOLDER}contact_sheet.png"
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 """Hugging Face's size categories, counted in steps."""
-CITATION = """@inproceedings{ortiz2024dmcvb,
-  title     = {{DMC-VB}: A Benchmark for Representation Learning for Control with Visual Distractors},
-  author    = {Ortiz, Joseph and Dedieu, Antoine and Lehrach, Wolfgang and Guntupalli, J. Swaroop and
-               Wendelken, Carter and Humayun, Ahmad and Zhou, Guangyao and Swaminathan, Sivaramakrishnan and
-               L{\\'a}zaro-Gredilla, Miguel and Murphy, Kevin},
-  booktitle = {Advances in Neural Information Processing Systems, Datasets and Benchmarks Track},
-  year      = {2024}
-}"""
 
 
 @checked
@@ -77,7 +69,7 @@ def write_card(release: Location, out: Local | None = None, url: str | None = No
 
 
 def _write_files(
-    release: Release, made: Path, folder: Path, published: Publication, keep_table: bool = False
+    release: Release, made: Path, folder: Path, published: dict[str, str], keep_table: bool = False
 ) -> list[str]:
     """Write a card's files below `made`.
 
@@ -96,7 +88,7 @@ def _write_files(
     summary = _summary(release, facts)
     texts = {
         README: card_text(release, facts, summary, limits),
-        CROISSANT: croissant(release, facts, summary, CITATION, limits, made / TABLE, published),
+        CROISSANT: croissant(release, facts, summary, limits, made / TABLE, published),
     }
     for name, text in texts.items():
         (made / name).write_text(text)
@@ -104,15 +96,15 @@ def _write_files(
     return [*texts, SHEET, TABLE]
 
 
-def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = None) -> Publication:
-    """Place and day of publication: the given one, else those of the existing card of this version, else today."""
+def _published(folder: Path, manifest: Manifest | Resolved, url: str | None = None) -> dict[str, str]:
+    """The "url" and "date" of publication: the given one, else those of this version's existing card, else today."""
     known = None
     with contextlib.suppress(OSError, ValueError):
         known = json.loads((folder / CROISSANT).read_text())
     if not isinstance(known, dict) or known.get("version") != manifest.version:
         known = {}
     date = str(known.get("datePublished") or datetime.date.today().isoformat())
-    return Publication(page_of(url) if url else str(known.get("url") or HOME), date)
+    return {"url": page_of(url) if url else str(known.get("url") or HOME), "date": date}
 
 
 def check_card(root: str | Path) -> list[str]:
@@ -206,7 +198,6 @@ def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Seq
         "card.md.jinja",
         manifest=manifest,
         digest=release.digest,
-        imported=release.manifest.imported,
         facts=facts,
         summary=summary,
         limits=limits,
@@ -215,11 +206,9 @@ def card_text(release: Release, facts: dict[str, Any], summary: str, limits: Seq
         arrays=_arrays(release),
         statistics=STATISTICS,
         successes={s.name: float(s.read("terminated").mean()) for s in release.subsets.values() if s.record.goal_mode},
-        distractors=_distractors(manifest),
-        has_mazes=any(record.goal_mode is not None for record in manifest.subsets),
+        distractors={r.setting: _varied(r.setting) for r in manifest.subsets if r.goal_mode is None},
         making=_making(release),
         policies=_policies(manifest),
-        first=next(iter(release.subsets)),
         group=groups(release)[0],
         sheet=SHEET,
         table=TABLE,
@@ -247,12 +236,6 @@ def _arrays(release: Release) -> dict[tuple, list[str]]:
         )
         kinds.setdefault(rows, []).append(name)
     return kinds
-
-
-def _distractors(manifest: Manifest | Resolved) -> list[tuple[str, str]]:
-    """Rows (setting, what varies and how much) of the table of distractors; none for mazes alone."""
-    settings = dict.fromkeys(record.setting for record in manifest.subsets if record.goal_mode is None)
-    return [(name, _varied(name)) for name in settings]
 
 
 def _varied(name: str) -> str:

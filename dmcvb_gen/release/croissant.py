@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,14 @@ from dmcvb_gen.storage.store import open_store
 
 HOME = "https://arxiv.org/abs/2409.18330"
 """The page of the benchmark that releases follow."""
+CITATION = """@inproceedings{ortiz2024dmcvb,
+  title     = {{DMC-VB}: A Benchmark for Representation Learning for Control with Visual Distractors},
+  author    = {Ortiz, Joseph and Dedieu, Antoine and Lehrach, Wolfgang and Guntupalli, J. Swaroop and
+               Wendelken, Carter and Humayun, Ahmad and Zhou, Guangyao and Swaminathan, Sivaramakrishnan and
+               L{\\'a}zaro-Gredilla, Miguel and Murphy, Kevin},
+  booktitle = {Advances in Neural Information Processing Systems, Datasets and Benchmarks Track},
+  year      = {2024}
+}"""
 TYPES = {"string": "sc:Text", "bool": "sc:Boolean", "float64": "sc:Float", "image": "sc:ImageObject"}
 """Types of the table of episodes that are no integers."""
 FIELDS = {
@@ -34,19 +41,6 @@ FIELDS = {
     "return_std": ("sc:Float", "standard deviation of the episode returns"),
 }
 """Fields of the table of subsets: name -> (type, meaning)."""
-
-
-@dataclass(frozen=True)
-class Publication:
-    """Place and date of a release's publication.
-
-    Attributes:
-      url: its page; the benchmark's if it is not known.
-      date: e.g. "2026-11-22".
-    """
-
-    url: str
-    date: str
 
 
 def page_of(url: str) -> str:
@@ -76,33 +70,25 @@ def derived_from(release: Release) -> list[str]:
 
 
 def croissant(
-    release: Release,
-    facts: dict[str, Any],
-    summary: str,
-    citation: str,
-    limits: Sequence[str],
-    table: Path,
-    published: Publication,
+    release: Release, facts: dict[str, Any], summary: str, limits: Sequence[str], table: Path, published: dict[str, str]
 ) -> str:
     """The JSON-LD document, from the template data/croissant.json.jinja.
 
     Args:
       facts: result of `describe_release`.
       summary: the description.
-      citation: BibTeX.
       limits: known limits, a sentence each.
       table: file of the table of episodes, see `release.episode_table`.
-      published: place and date of publication.
+      published: "url" and "date" of publication; the benchmark's page if its own is not known.
     """
     manifest = release.manifest
     text = fill(
         "croissant.json.jinja",
         manifest=manifest,
         generator=generator(release),
-        imported=manifest.imported,
         derived=derived_from(release),
         summary=summary,
-        citation=citation,
+        citation=CITATION,
         limits=limits,
         published=published,
         tasks=", ".join(dict.fromkeys(record.task for record in manifest.subsets)),
