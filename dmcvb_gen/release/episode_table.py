@@ -7,9 +7,8 @@ The viewer of the Hugging Face Hub shows it, and `datasets.load_dataset` reads i
 from __future__ import annotations
 
 import contextlib
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -21,10 +20,7 @@ from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.inputs import background_source
 from dmcvb_gen.generate.render import renderer_for
 from dmcvb_gen.generate.resolve import check_task_code
-from dmcvb_gen.release.export.episodes import png
-
-if TYPE_CHECKING:
-    import pyarrow as pa
+from dmcvb_gen.release.export.episodes import png, table_schema
 
 TABLE = f"{CARD_FOLDER}episodes.parquet"
 CONFIG = {"config_name": "episodes", "default": True, "data_files": [{"split": "train", "path": TABLE}]}
@@ -55,11 +51,12 @@ def write_table(release: Release, path: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    with parquet.ParquetWriter(path, _schema(), compression="zstd") as writer:
+    schema = table_schema({name: (kind, 1) for name, (kind, _) in COLUMNS.items()})
+    with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
         for subset in release.subsets.values():
             for first in range(0, len(subset.episodes), ROWS):
                 few = subset.episodes[first : first + ROWS]
-                writer.write_table(pa.Table.from_pydict(_facts(subset, few) | _frames(subset, few), _schema()))
+                writer.write_table(pa.Table.from_pydict(_facts(subset, few) | _frames(subset, few), schema))
 
 
 def table_rows(path: Path) -> set[tuple]:
@@ -72,18 +69,6 @@ def table_rows(path: Path) -> set[tuple]:
     except (pa.ArrowInvalid, OSError, KeyError):
         return set()
     return {tuple(row.values()) for row in table.to_pylist()}
-
-
-def _schema() -> pa.Schema:
-    import pyarrow as pa
-
-    features: dict[str, Any] = {
-        name: {"_type": "Image"} if kind == "image" else {"dtype": kind, "_type": "Value"}
-        for name, (kind, _) in COLUMNS.items()
-    }
-    picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # as `datasets` stores one
-    fields = [(name, picture if kind == "image" else pa.type_for_alias(kind)) for name, (kind, _) in COLUMNS.items()]
-    return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": features}})})
 
 
 def _facts(subset: Subset, episodes: np.ndarray) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, sha256_bytes, write_json
 from dmcvb_gen.loaders.release import SubsetReader, open_for_reading
 from dmcvb_gen.options import Local, Location, Names, Span, checked, progress_bar
-from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, open_pool
+from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order
 from dmcvb_gen.release.export.episodes import Source
 from dmcvb_gen.release.export.registry import get_format
 from dmcvb_gen.storage.errors import storage_errors
@@ -93,12 +93,9 @@ def export(
         stamp = _stamp(source[name], to, episodes)
         works.append(_Work(path, storage_options, to, name, episodes, folder / kind.folder_name(name), stamp))
     todo = [work for work in works if not work.done]
-    with progress_bar(progress, " episodes", scaled=False) as bar, open_pool(workers, tick=bar, most=len(todo)) as pool:
+    with progress_bar(progress, " episodes", scaled=False) as bar:
         expect(bar, sum(len(work.episodes) for work in todo))
-        for work in todo:
-            pool.submit(work.folder, _write, work)
-        for _ in pool.results():
-            pass
+        in_order(_write, todo, workers, bar)
     return [work.folder for work in works]
 
 

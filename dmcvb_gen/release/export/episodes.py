@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +14,9 @@ from dmcvb_gen.dataset.manifest import Manifest, Resolved
 from dmcvb_gen.dataset.pictures import Pictures, shown
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -139,3 +144,27 @@ def png(frame: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, "PNG")
     return buffer.getvalue()
+
+
+def table_schema(columns: Mapping[str, tuple[str, int]]) -> pa.Schema:
+    """The schema of a Parquet table, with the metadata by which Hugging Face's `datasets` knows pictures.
+
+    Args:
+      columns: name -> its type, "float32", ... or "image", and how many numbers a row has of it.
+    """
+    import pyarrow as pa
+
+    fields: list[pa.Field] = []
+    features: dict[str, Any] = {}
+    for name, (dtype, count) in columns.items():
+        if dtype == "image":
+            kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+            features[name] = {"_type": "Image"}
+        else:
+            kind = pa.type_for_alias(dtype)
+            features[name] = {"dtype": dtype, "_type": "Value"}
+            if count > 1:  # LeRobot takes a single number for a scalar
+                kind = pa.list_(kind, count)
+                features[name] = {"feature": features[name], "length": count, "_type": "List"}
+        fields.append(pa.field(name, kind))
+    return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": features}})})

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dmcvb_gen.generate.modalities import modality_of
-from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png
+from dmcvb_gen.release.export.episodes import ExportEpisode, Source, png, table_schema
 from dmcvb_gen.release.export.registry import register_exporter
 
 if TYPE_CHECKING:
@@ -173,31 +173,13 @@ class _Layout:
             "task_index": np.zeros(length, int),
         }
 
-    def schema(self) -> pa.Schema:
-        """Return the schema of the data tables, with the metadata that Hugging Face's `datasets` wants."""
-        import pyarrow as pa
-
-        fields: list[pa.Field] = []
-        huggingface: dict[str, Any] = {}
-        for name, feature in self.features.items():
-            if feature["dtype"] == "image":
-                kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-                huggingface[name] = {"_type": "Image"}
-            else:
-                kind = {"float32": pa.float32(), "bool": pa.bool_(), "int64": pa.int64()}[feature["dtype"]]
-                huggingface[name] = {"dtype": feature["dtype"], "_type": "Value"}
-                if (length := feature["shape"][0]) > 1:  # LeRobot takes a single number for a scalar
-                    kind = pa.list_(kind, length)
-                    huggingface[name] = {"feature": huggingface[name], "length": length, "_type": "List"}
-            fields.append(pa.field(name, kind))
-        return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": huggingface}})})
-
 
 class _Files:
     """The tables, `EPISODES_PER_FILE` episodes a file, a row group an episode."""
 
     def __init__(self, folder: Path, layout: _Layout):
-        self._folder, self._schema = folder, layout.schema()
+        self._folder = folder
+        self._schema = table_schema({name: (one["dtype"], one["shape"][0]) for name, one in layout.features.items()})
         self._table: Any = None
 
     def add(self, columns: dict[str, np.ndarray], number: int) -> dict[str, Any]:
@@ -216,16 +198,14 @@ class _Files:
     def _rows(self, columns: dict[str, np.ndarray]) -> pa.Table:
         import pyarrow as pa
 
-        arrays = []
+        rows: dict[str, Any] = {}
         for field in self._schema:
             values = columns[field.name]
             if pa.types.is_struct(field.type):
-                arrays.append(pa.array([{"bytes": png(frame), "path": None} for frame in values], field.type))
-                continue
-            many = pa.types.is_fixed_size_list(field.type)
-            flat = pa.array(values.ravel(), field.type.value_type if many else field.type)
-            arrays.append(pa.FixedSizeListArray.from_arrays(flat, field.type.list_size) if many else flat)
-        return pa.table(arrays, schema=self._schema)
+                rows[field.name] = [{"bytes": png(frame), "path": None} for frame in values]
+            else:
+                rows[field.name] = list(values) if pa.types.is_fixed_size_list(field.type) else values.ravel()
+        return pa.table(rows, self._schema)
 
     def close(self) -> None:
         """End the file that is open."""
@@ -248,7 +228,6 @@ class _Statistics:
         flat: dict[str, list] = {}
         shape: tuple[int, ...]
         for name, value in columns.items():
-            count = np.array([len(value)])
             if value.dtype == np.uint16:
                 value, shape = value.reshape(-1, 1).astype(np.float64), (1, 1, 1)
             elif value.ndim == 4:
@@ -259,7 +238,7 @@ class _Statistics:
             part = {key: getattr(value, key)(axis=0).reshape(shape) for key in ("min", "max", "mean", "std")}
             found = np.quantile(value, list(QUANTILES.values()), axis=0)
             part |= {key: number.reshape(shape) for key, number in zip(QUANTILES, found, strict=True)}
-            part["count"] = count
+            part["count"] = np.array([len(columns[name])])
             self._parts.setdefault(name, []).append(part)
             flat |= {f"stats/{name}/{key}": number.tolist() for key, number in part.items()}
         return flat

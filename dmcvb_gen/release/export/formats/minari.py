@@ -82,7 +82,6 @@ def _environment(source: Source, split: str) -> EnvSpec:
 
     Episodes are cut where the data's are, and so compare with the reference scores.
     """
-    import gymnasium
     from gymnasium.envs.registration import EnvSpec
 
     from dmcvb_gen.loaders.matching import environment_options
@@ -90,10 +89,7 @@ def _environment(source: Source, split: str) -> EnvSpec:
     record = source.subset.record
     options = environment_options(source.subset, split)
     name = environment_id(record.name.split("/")[0], record.setting.partition("_")[0])
-    registered = gymnasium.registry.get(name)
-    spec = EnvSpec(name, entry_point=registered.entry_point if registered else ENTRY_POINT, kwargs=options)
-    spec.order_enforce, spec.disable_env_checker = True, True
-    return spec
+    return EnvSpec(name, entry_point=ENTRY_POINT, disable_env_checker=True, kwargs=options)
 
 
 def _about_videos(source: Source) -> str:

@@ -23,17 +23,17 @@ def write(source: Source, folder: Path) -> None:
     root = zarr.open_group(str(folder / "replay_buffer.zarr"), mode="w", zarr_format=2)
     root.attrs.update({"description": source.description, "joints": source.joints})
     data, meta = root.create_group("data"), root.create_group("meta")
-    ends: list[int] = []
+    arrays: dict[str, zarr.Array] = {}
+    lengths: list[int] = []
     for episode in source:
         length = episode.length
         single = len(episode.pixels) == 1
         values = {"img" if single else f"img_{view}": frames[:length] for view, frames in episode.pixels.items()}
         values |= {"state": episode.state[:length], "action": episode.action, "reward": episode.reward}
         values |= {name: value[:length] for name, value in episode.named_modalities().items()}
-        before = ends[-1] if ends else 0
         for name, value in values.items():
-            if name not in data:
-                data.create_array(
+            if name not in arrays:
+                arrays[name] = data.create_array(
                     name,
                     shape=(0, *value.shape[1:]),
                     chunks=(CHUNK, *value.shape[1:]),
@@ -41,9 +41,6 @@ def write(source: Source, folder: Path) -> None:
                     compressors=Blosc(cname="zstd", clevel=5, shuffle=Blosc.BITSHUFFLE),
                     attributes={"names": source.names[name]} if name in source.names else {},
                 )
-            stored = data[name]
-            assert isinstance(stored, zarr.Array)
-            stored.resize((before + length, *value.shape[1:]))
-            stored[before:] = value
-        ends.append(before + length)
-    meta.create_array("episode_ends", data=np.array(ends, np.int64))
+            arrays[name].append(value)
+        lengths.append(length)
+    meta.create_array("episode_ends", data=np.cumsum(lengths, dtype=np.int64))
