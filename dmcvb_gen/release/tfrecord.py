@@ -4,43 +4,24 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator, Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import google_crc32c
 import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory, text_format
 
 from dmcvb_gen.errors import StoreError
 
 MAX_RECORD = 2**31
 """Bytes of a record beyond which the file is taken to be damaged."""
 
-_FIELD = descriptor_pb2.FieldDescriptorProto
-_LISTS = {"bytes_list": ("BytesList", _FIELD.TYPE_BYTES), "float_list": ("FloatList", _FIELD.TYPE_FLOAT)}
-_LISTS |= {"int64_list": ("Int64List", _FIELD.TYPE_INT64)}
-
 
 def _example_class() -> Any:
-    """tf.train.Example as its published definition (tensorflow/core/example) says it."""
-    file = descriptor_pb2.FileDescriptorProto(name="dmcvb_gen/example.proto", package="dmcvb_gen", syntax="proto3")
-    feature = descriptor_pb2.DescriptorProto(name="Feature")
-    feature.oneof_decl.add(name="kind")
-    for number, (field, (kind, of)) in enumerate(_LISTS.items(), 1):
-        values = file.message_type.add(name=kind).field.add(name="value", number=1, type=of)
-        values.label = _FIELD.LABEL_REPEATED
-        member = feature.field.add(name=field, number=number, type=_FIELD.TYPE_MESSAGE, type_name=f".dmcvb_gen.{kind}")
-        member.label, member.oneof_index = _FIELD.LABEL_OPTIONAL, 0
-    file.message_type.append(feature)
-    features = file.message_type.add(name="Features")
-    entry = features.nested_type.add(name="FeatureEntry", options={"map_entry": True})
-    entry.field.add(name="key", number=1, type=_FIELD.TYPE_STRING, label=_FIELD.LABEL_OPTIONAL)
-    whole, one, many = _FIELD.TYPE_MESSAGE, _FIELD.LABEL_OPTIONAL, _FIELD.LABEL_REPEATED
-    entry.field.add(name="value", number=2, type=whole, type_name=".dmcvb_gen.Feature", label=one)
-    entries = ".dmcvb_gen.Features.FeatureEntry"
-    features.field.add(name="feature", number=1, type=whole, type_name=entries, label=many)
-    example = file.message_type.add(name="Example")
-    example.field.add(name="features", number=1, type=whole, type_name=".dmcvb_gen.Features", label=one)
+    """tf.train.Example, from its definition in data/example.textproto."""
+    text = (resources.files("dmcvb_gen.release") / "data" / "example.textproto").read_text()
+    file = text_format.Parse(text, descriptor_pb2.FileDescriptorProto())
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("dmcvb_gen.Example"))
