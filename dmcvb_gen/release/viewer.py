@@ -25,6 +25,7 @@ from dmcvb_gen.files import sha256_bytes, write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
 from dmcvb_gen.loaders.release import SubsetReader, open_for_reading
 from dmcvb_gen.options import Count, Local, Location, Names, checked, progress_bar
+from dmcvb_gen.release.export.episodes import entry_names
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import is_url, local_path
 from dmcvb_gen.storage.places import shown as shown_place
@@ -156,15 +157,13 @@ def _command(release: Release, path: str, subset: SubsetReader, index: int) -> s
 
 def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
     """Collect what the page shows of an episode: facts, views with their raw frames, and groups of curves."""
-    pictures, layer = shown(subset), subset.trajectories
+    pictures, layer, names = shown(subset), subset.trajectories, entry_names(subset)
     span = layer.episodes_of(index // layer.episodes_per_shard)
     shows = subset.setting != "none"
     labels = [name for name in DISTRACTOR_STATE_NAMES if shows and f"exogenous/{name}" in subset.arrays]
     numbers = ["state", "action", "reward", "seed", "terminated"]
     values = subset.episode(index, [*numbers, *(f"exogenous/{name}" for name in labels), *pictures.arrays])
     earned = np.concatenate([[0], np.cumsum(values["reward"], dtype=float)])
-    actuators = [name or f"action {n}" for n, name in enumerate(subset.record.actuators)]
-    actuators = actuators or [f"action {n}" for n in range(values["action"].shape[1])]
     return {
         "subset": subset.name,
         "index": index,
@@ -179,8 +178,8 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
         "frames": {view: values[name] for view, name in zip(pictures.views, pictures.arrays, strict=True)},
         "curves": {
             "reward": [_curve("reward", values["reward"]), _curve("return so far", earned)],
-            "action": [_curve(name, column) for name, column in zip(actuators, values["action"].T, strict=True)],
-            "state": [_curve(name, column) for name, column in _state_columns(subset, values["state"])],
+            "action": [_curve(name, column) for name, column in zip(names["action"], values["action"].T, strict=True)],
+            "state": [_curve(name, column) for name, column in zip(names["state"], values["state"].T, strict=True)],
             "distractor": [
                 _curve(name, column)
                 for label in labels
@@ -188,13 +187,6 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
             ],
         },
     }
-
-
-def _state_columns(subset: SubsetReader, state: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    fields = subset.spec("state").attributes.get("fields") or {"state": (0, state.shape[1])}
-    for name, (first, last) in fields.items():
-        for column in range(first, last):
-            yield (name if last - first == 1 else f"{name} {column - first}"), state[:, column]
 
 
 def _label_columns(label: str, values: np.ndarray, views: Sequence[str]) -> Iterator[tuple[str, np.ndarray]]:

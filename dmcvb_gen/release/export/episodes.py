@@ -12,6 +12,7 @@ import numpy as np
 
 from dmcvb_gen.dataset.manifest import Manifest, Resolved
 from dmcvb_gen.dataset.pictures import Pictures, shown
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 
@@ -105,11 +106,7 @@ class Source:
     @property
     def names(self) -> dict[str, list[str]]:
         """Array ("state", "action") -> a name for each of its entries."""
-        fields = sorted(self.subset.spec("state").attributes["fields"].items(), key=lambda field: field[1])
-        state = [f"{name}.{i}" for name, (first, last) in fields for i in range(last - first)]
-        size = self.subset.array("action").shape[-1]
-        actuators = self.subset.record.actuators or [""] * size
-        return {"state": state, "action": [name or f"actuator.{i}" for i, name in enumerate(actuators)]}
+        return entry_names(self.subset)
 
     @property
     def joints(self) -> list[str]:
@@ -135,6 +132,15 @@ class Source:
                 **{name: values[name] for name in ("state", "action", "reward", "discount")},
             )
             self.tick(1)
+
+
+def entry_names(subset: Subset) -> dict[str, list[str]]:
+    """Array ("state", "action") -> a name for each of its entries."""
+    places = range(subset.array("state").shape[-1])  # a field that says it has more has no more
+    fields = sorted(subset.spec("state").attributes["fields"].items(), key=lambda field: field[1])
+    state = [f"{name}.{i}" for name, (first, last) in fields for i, _ in enumerate(places[first:last])]
+    actuators = subset.record.actuators or [""] * subset.array("action").shape[-1]
+    return {"state": state, "action": [name or f"actuator.{i}" for i, name in enumerate(actuators)]}
 
 
 def png(frame: np.ndarray) -> bytes:
