@@ -48,7 +48,7 @@ def parse_folder(parts: tuple[str, ...]) -> tuple[str, str, str, int | None] | N
     if first in _FOLDERS:
         setting, task = _FOLDERS[first], f"{ANT_MAZE}-{second}"
         if setting == FIXED:
-            return (task, "expert", setting, int(third)) if third.isdigit() else None
+            return (task, "expert", setting, int(third)) if third.isdecimal() else None
         return task, third, setting, None
     task = first.replace("_", "-")
     return (task, second, third, None) if not is_maze(task) or third in GOAL_MODES else None

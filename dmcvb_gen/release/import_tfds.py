@@ -28,7 +28,7 @@ from dmcvb_gen.parallel import ProgressCallback
 from dmcvb_gen.release.dmcvb_names import parse_folder, picture_feature, state_feature
 from dmcvb_gen.release.tfrecord import offsets, read_example
 from dmcvb_gen.rendering.base import MAX_SIZE
-from dmcvb_gen.spec import FIXED, LEVELS, SubsetSpec, subset_name
+from dmcvb_gen.spec import FIXED, LEVELS, SubsetSpec
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
 from dmcvb_gen.tasks import ACTION_REPEAT, get_task
@@ -153,27 +153,26 @@ def _layers(source: _Source) -> Iterator[Layer]:
 
 def _sources(found: list[Path], task, level, setting) -> Iterator[_Source]:
     """The subsets that folders hold; the folders of a maze's fixed goals, one a goal, are one subset."""
-    grouped: dict[str, list[tuple[Path, tuple[str, str, str, int | None]]]] = {}
+    grouped: dict[SubsetSpec, list[tuple[int, Path]]] = {}
     for path in found:
-        facts = _identify(path, task, level, setting)
-        grouped.setdefault(subset_name(*facts[:3]), []).append((path, facts))
-    for name, members in grouped.items():
-        fixed = members[0][1][2] == FIXED
-        if len(members) > 1 and not fixed:
-            raise StoreError(f"{members[1][0]} and {members[0][0]} are both {name}; import one of them")
-        members.sort(key=lambda member: member[1][3] or 0)
-        folders = tuple(path for path, _ in members)
+        spec, seed = _identify(path, task, level, setting)
+        grouped.setdefault(spec, []).append((seed, path))
+    for spec, members in grouped.items():
+        folders = tuple(path for _, path in sorted(members))
+        if len(folders) > 1 and spec.setting != FIXED:
+            raise StoreError(f"{folders[1]} and {folders[0]} are both {spec.name}; import one of them")
         files = [(goal, file) for goal, path in enumerate(folders) for file in _files(path)]
         places = tuple(Place(goal, file, *place) for goal, file in files for place in offsets(file))
-        yield _Source(_record(name, members[0][1][:3], folders, places), folders, places)
+        yield _Source(_record(spec, folders, places), folders, places)
 
 
-def _identify(path: Path, task, level, setting) -> tuple[str, str, str, int | None]:
+def _identify(path: Path, task, level, setting) -> tuple[SubsetSpec, int]:
+    """The subset that a folder holds, and of fixed goals the seed that its path names."""
     guess = parse_folder(path.parts) or ("", "", "", None)
     task, level, setting = task or guess[0], level or guess[1], setting or guess[2]
     try:
         get_task(task)
-        spec = SubsetSpec.parse(task, level, setting)
+        return SubsetSpec.parse(task, level, setting), guess[3] or 0
     except UnknownNameError:
         if "-" in level and set(level.split("-")) <= set(LEVELS):
             raise StoreError(f"{path} unites levels; export each of them, and import those") from None
@@ -182,38 +181,34 @@ def _identify(path: Path, task, level, setting) -> tuple[str, str, str, int | No
             ".../antmaze_random_hidden_goal/empty7x7/expert or .../antmaze_fixed_hidden_goal/empty7x7/<seed>; give "
             f"--task, --level ({', '.join(LEVELS)}) and --setting"
         ) from None
-    return task, level, spec.setting, guess[3]
 
 
-def _record(
-    name: str, facts: tuple[str, str, str], folders: tuple[Path, ...], places: tuple[Place, ...]
-) -> SubsetRecord:
-    task, level, setting = facts
+def _record(spec: SubsetSpec, folders: tuple[Path, ...], places: tuple[Place, ...]) -> SubsetRecord:
     repeat, _ = _metadata(folders[0])
-    hidden, of = SubsetSpec.parse(task, level, setting).hides_goal, get_task(task).at(repeat)
-    images, sizes = {view: picture_feature(task, view, hidden) for view in of.views}, _image_sizes(folders[0])
+    of, sizes = get_task(spec.task).at(repeat), _image_sizes(folders[0])
+    images = {view: picture_feature(spec.task, view, spec.hides_goal) for view in of.views}
     views = tuple(view for view, image in images.items() if image in sizes)
     if not views:
-        wanted = images[of.views[0]]
-        raise StoreError(f"{folders[0]}/features.json has no image observation/{wanted}; it is no {name} of DMC-VB")
+        first = images[of.views[0]]
+        raise StoreError(f"{folders[0]}/features.json has no image observation/{first}; it is no {spec.name} of DMC-VB")
     for number, path in enumerate(folders):
         if not any(place.folder == number for place in places):
             raise StoreError(f"{path} holds no episodes (no *.tfrecord* files with records)")
-    pairs = [_goal_pair(place, place.read(), len(folders)) for place in places] if setting == FIXED else []
+    pairs = [_goal_pair(place, place.read(), len(folders)) for place in places] if spec.setting == FIXED else []
     goals = max(pairs, default=0) + 1
     in_order = pairs == [pair for pair in range(goals) for _ in range(len(pairs) // goals)]
     return SubsetRecord(
-        name=name,
-        task=task,
-        level=level,
-        setting=setting,
+        name=spec.name,
+        task=spec.task,
+        level=str(spec.level),
+        setting=spec.setting,
         episodes=len(places),
         layers=("none-yet",),
         size=sizes[images[views[0]]],
         renderer={"name": IMPORTED},
         family=of.family,
         views=views,
-        hidden_goal=hidden,
+        hidden_goal=spec.hides_goal,
         max_steps=_time_limit(places, of),
         action_repeat=repeat,
         seconds_per_step=of.seconds_per_step,
