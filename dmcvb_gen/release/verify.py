@@ -156,7 +156,7 @@ def verify_folder(
         raise DmcvbError(f"{place} has no episodes yet; run the rollout first")
     for found in in_order(_check_subset, [(subset, backgrounds) for subset in chosen], workers, tick):
         findings += found
-    result = _verification(release, chosen, findings, (files, files), sound)
+    result = _verification(release, chosen, findings, files, files)
     return replace(result, incomplete=release.unfinished | result.incomplete) if names is None else result
 
 
@@ -176,8 +176,8 @@ def _verify_bytes(release: Release, everything: bool, tick: ProgressCallback, wo
     if not everything:
         read = {file.path for _, file in sample}
         findings += _wrong_sizes(release, [(place, file) for place, file in files if file.path not in read])
-    sound = _sound(release, findings)
-    return _verification(release, [subset for subset in sound if len(subset)], findings, (sample, files), sound)
+    chosen = [subset for subset in _sound(release, findings) if len(subset)]
+    return _verification(release, chosen, findings, sample, files)
 
 
 def _sound(release: Release, findings: Sequence[Issue]) -> list[Subset]:
@@ -187,24 +187,20 @@ def _sound(release: Release, findings: Sequence[Issue]) -> list[Subset]:
 
 
 def _verification(
-    release: Release,
-    chosen: Sequence[Subset],
-    findings: list[Issue],
-    files: tuple[Sequence[Listed], Sequence[Listed]],
-    sound: Sequence[Subset],
+    release: Release, chosen: Sequence[Subset], findings: list[Issue], looked_at: list[Listed], files: list[Listed]
 ) -> Verification:
     """The result of a verification.
 
     Args:
-      files: those that were read, and all.
-      sound: subsets whose layers have no finding.
+      chosen: subsets that were checked.
+      looked_at, files: files that were read, and all.
     """
-    read, covered = (sum(not file.path.endswith(ZARR_JSON) for _, file in some) for some in files)
+    read, covered = (sum(not file.path.endswith(ZARR_JSON) for _, file in some) for some in (looked_at, files))
     counts = {"subsets": len(chosen), "episodes": 0, "steps": 0, "files": read}
     for subset in chosen:
         counts["episodes"] += len(subset)
         counts["steps"] += subset.steps
-    lacking = [subset for subset in sound if len(subset) < subset.record.episodes]
+    lacking = [subset for subset in _sound(release, findings) if len(subset) < subset.record.episodes]
     incomplete = {subset.name: (len(subset), subset.record.episodes) for subset in lacking}
     unchecked = tuple(finding for finding in findings if finding.check == UNCHECKED)
     faults = tuple(finding for finding in findings if finding.check != UNCHECKED)
