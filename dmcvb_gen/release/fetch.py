@@ -161,20 +161,16 @@ class _Download:
         for first in range(0, len(absent), self._workers):
             few = absent[first : first + self._workers]
             self.bring([file for shard in few for file in shard.files])
-            for shard in few:
-                self._record(shard)
+            for shard in few:  # their records come after their files, and the lists say what is in them
+                if wrong_bytes(self.target, shard.record_file):
+                    self.target.replace(shard.record_path, canonical_json(shard.record))
+                    self.moved += 1
+                self._tick(shard.record_file.bytes)
 
     def bring(self, files: Sequence[FileRecord]) -> None:
         """Bring files that are not here as they are recorded, some at a time."""
         with ThreadPoolExecutor(max(1, self._workers)) as pool:
             self.moved += sum(pool.map(self._bring_one, files))
-
-    def _record(self, shard: Shard) -> None:
-        """Write a shard's record after its files. The layer's list says what is in it."""
-        if wrong_bytes(self.target, shard.record_file):
-            self.target.replace(shard.record_path, canonical_json(shard.record))
-            self.moved += 1
-        self._tick(shard.record_file.bytes)
 
     def _bring_one(self, file: FileRecord) -> bool:
         wrong = wrong_bytes(self.target, file)
