@@ -44,9 +44,8 @@ def write(source: Source, folder: Path) -> None:
         columns = layout.frames(episode, len(rows), index) | layout.pictures(episode)
         row = {"episode_index": len(rows), "tasks": [layout.task], "length": episode.length}
         row |= {"dataset_from_index": index, "dataset_to_index": index + episode.length}
-        row |= files.add(columns, len(rows))
-        rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
-        rows[-1] |= statistics.add(columns)
+        row |= files.add(columns, len(rows)) | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        rows.append(row | statistics.add(columns))
         index += episode.length
     files.close()
     _write_meta(folder, layout, rows, index, statistics)
