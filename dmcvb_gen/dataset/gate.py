@@ -343,9 +343,6 @@ class Release:
         """Names of the subsets that have episodes here."""
         return iter(self.subsets)
 
-    def __contains__(self, name: object) -> bool:
-        return name in self.subsets
-
     def __len__(self) -> int:
         return len(self.subsets)
 

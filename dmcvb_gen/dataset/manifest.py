@@ -465,13 +465,9 @@ class Copy(_Model):
 
 def runs(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
     """Numbers as runs (first, last + 1), in order."""
-    found: list[tuple[int, int]] = []
-    for number in sorted(numbers):
-        if found and found[-1][1] == number:
-            found[-1] = (found[-1][0], number + 1)
-        else:
-            found.append((number, number + 1))
-    return tuple(found)
+    each = np.array(sorted(numbers), int)
+    parts = np.split(each, np.flatnonzero(np.diff(each) != 1) + 1)
+    return tuple((int(part[0]), int(part[-1]) + 1) for part in parts if len(part))
 
 
 # -- JSON -----------------------------------------------------------------------------------------

@@ -109,6 +109,7 @@ class Subset:
     Attributes:
       release: the `gate.Release` that it belongs to.
       record: its entry in the manifest.
+      name, task, level, setting: as the record has them.
       fresh: True if each epoch shows other distractors.
       epoch: epoch of the distractors; 0 if they are those of the data.
       other_videos: folder of the videos that are shown, or "builtin"; None for those that the release names.
@@ -122,26 +123,11 @@ class Subset:
 
     def __init__(self, release: Any, record: SubsetRecord):
         self.release, self.record = release, record
+        self.name, self.task, self.level, self.setting = record.name, record.task, record.level, record.setting
 
     def set_epoch(self, epoch: int) -> None:
         """Show the distractors of another epoch from now on, if they are fresh."""
         self.epoch = epoch if self.fresh else 0
-
-    @property
-    def name(self) -> str:
-        return self.record.name
-
-    @property
-    def task(self) -> str:
-        return self.record.task
-
-    @property
-    def level(self) -> str:
-        return self.record.level
-
-    @property
-    def setting(self) -> str:
-        return self.record.setting
 
     def __repr__(self) -> str:
         return f"<Subset {self.name}: {len(self.episodes)} of {self.record.episodes} episodes>"

@@ -280,10 +280,7 @@ def _listed_records(store: Store) -> dict[str, dict[int, ShardRecord]]:
 
 def _leading(records: Mapping[int, ShardRecord]) -> tuple[ShardRecord, ...]:
     """The records from the first shard up to the first gap."""
-    leading: list[ShardRecord] = []
-    while (record := records.get(len(leading))) is not None:
-        leading.append(record)
-    return tuple(leading)
+    return tuple(record for place, (number, record) in enumerate(sorted(records.items())) if number == place)
 
 
 # -- for plain readers ----------------------------------------------------------------------------
