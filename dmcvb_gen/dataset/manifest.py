@@ -19,7 +19,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import pydantic
@@ -337,22 +337,6 @@ def _check_unique(names: Collection[str], what: str) -> None:
         seen.add(name.casefold())
 
 
-def _check_tree(subsets: tuple[SubsetRecord, ...], layers: Iterable[Layer]) -> None:
-    named = {layer.name: layer for layer in layers}
-    _check_unique([subset.name for subset in subsets], "subsets")
-    _check_unique(list(named), "layers")
-    places = [f"{layer.group}/{spec.stored_name}" for layer in named.values() for spec in layer.arrays]
-    _check_unique(places, "arrays")
-    for subset in subsets:
-        if lacking := [name for name in subset.layers if name not in named]:
-            raise ValueError(f"{subset.name} names layer {lacking[0]}, which is not described")
-        kinds = [named[name].kind for name in subset.layers]
-        if kinds[0] != "trajectories":
-            raise ValueError(f"the first layer of {subset.name} holds no trajectories")
-        if not subset.imported and (kinds[1:2] != ["labels"] or "name" not in subset.renderer):
-            raise ValueError(f"{subset.name} has no labels, or no renderer")
-
-
 SAID = ("name", "version", "license", "authors", "description")
 """What a recipe and a manifest say of a release for people."""
 
@@ -367,6 +351,7 @@ class _Described(_Model):
     authors: tuple[Line, ...] = pydantic.Field(default=(), max_length=1000)
     description: str = pydantic.Field(default="", max_length=10_000)
     inputs: tuple[FileRecord, ...] = pydantic.Field(default=(), max_length=10**6)
+    layers: tuple[Layer, ...] = pydantic.Field(max_length=MAX_SHARDS)
     subsets: tuple[SubsetRecord, ...] = pydantic.Field(max_length=MAX_SHARDS)
 
     @pydantic.field_validator("inputs")
@@ -375,6 +360,23 @@ class _Described(_Model):
         if strange := [file.path for file in inputs if not file.path.startswith((POLICIES, VIDEOS))]:
             raise ValueError(f"{strange[0]} is no policy and no video")
         return inputs
+
+    @pydantic.model_validator(mode="after")
+    def _one_tree(self) -> Self:
+        named = {layer.name: layer for layer in self.layers}
+        _check_unique([subset.name for subset in self.subsets], "subsets")
+        _check_unique(list(named), "layers")
+        places = [f"{layer.group}/{spec.stored_name}" for layer in named.values() for spec in layer.arrays]
+        _check_unique(places, "arrays")
+        for subset in self.subsets:
+            if lacking := [name for name in subset.layers if name not in named]:
+                raise ValueError(f"{subset.name} names layer {lacking[0]}, which is not described")
+            kinds = [named[name].kind for name in subset.layers]
+            if kinds[0] != "trajectories":
+                raise ValueError(f"the first layer of {subset.name} holds no trajectories")
+            if not subset.imported and (kinds[1:2] != ["labels"] or "name" not in subset.renderer):
+                raise ValueError(f"{subset.name} has no labels, or no renderer")
+        return self
 
     @property
     def imported(self) -> bool:
@@ -393,13 +395,7 @@ class Resolved(_Described):
 
     format: Literal["dmcvb-gen recipe"] = "dmcvb-gen recipe"
     recipe: dict[str, Any] = {}
-    layers: tuple[Layer, ...] = pydantic.Field(max_length=MAX_SHARDS)
     derived: dict[str, Any] | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _whole(self) -> Resolved:
-        _check_tree(self.subsets, self.layers)
-        return self
 
     @functools.cached_property
     def sha256(self) -> str:
@@ -421,7 +417,6 @@ class Manifest(_Described):
 
     @pydantic.model_validator(mode="after")
     def _whole(self) -> Manifest:
-        _check_tree(self.subsets, self.layers)
         named = {layer.name: layer for layer in self.layers}
         for subset in self.subsets:
             for layer in (named[name] for name in subset.layers):
