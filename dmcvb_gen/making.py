@@ -143,7 +143,8 @@ def make(
     import numpy as np
 
     from dmcvb_gen.generate.request import EPISODES
-    from dmcvb_gen.loaders import UnionReader, open_for_reading
+    from dmcvb_gen.loaders.release import open_for_reading
+    from dmcvb_gen.loaders.union import UnionReader
     from dmcvb_gen.tasks import typed_task
 
     try:

@@ -17,7 +17,7 @@ import yaml
 from PIL import Image, ImageDraw, ImageFont
 
 import dmcvb_gen
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.preview import video_bytes, video_frames
 from dmcvb_gen.loaders.register import MAZES, TASKS
 

@@ -10,7 +10,7 @@ import argparse
 import tarfile
 from pathlib import Path
 
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import MANIFEST, RECIPES
 from dmcvb_gen.generate.shipped import ENDING, pack
 from dmcvb_gen.release.tree import list_files

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.modalities import all_modalities
 from dmcvb_gen.registry import Registry

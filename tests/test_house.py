@@ -76,7 +76,7 @@ def test_the_architecture_names_every_package_and_no_other():
 
 
 LIGHT = [
-    ("import dmcvb_gen.dataset, dmcvb_gen.spec", ("mujoco", "torch")),
+    ("import dmcvb_gen.dataset.writer, dmcvb_gen.spec", ("mujoco", "torch")),
     ("main(['list'])", ("numba", "scipy", "torch", "zarr", "xarray", "matplotlib")),
     ("main(['info', RELEASE])", ("numba", "scipy", "torch", "mujoco", "dm_control", "xarray", "matplotlib")),
     ("main(['--help'])", ("numpy", "rich", "pydantic", "zarr", "mujoco")),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.pictures import shown
 from tests.conftest import run, told
 

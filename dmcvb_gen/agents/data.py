@@ -21,8 +21,9 @@ from torch import nn
 
 from dmcvb_gen.agents.learners import Batch
 from dmcvb_gen.arithmetic import to_unit
-from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.pictures import shown
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.dataset.steps import FIELDS, Selection, StepTable
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.parallel import ignore

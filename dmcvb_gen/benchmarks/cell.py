@@ -40,8 +40,9 @@ from dmcvb_gen.agents.probe import action_probe
 from dmcvb_gen.agents.trainer import Budget, Curve, draw, train
 from dmcvb_gen.benchmarks.evaluate import SPLIT, Evaluator, Score, TrainedAgent, evaluation_steps, renderer_choice
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, ENCODER, Cell, Results, goal_cells
-from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import canonical_json
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.files import replacing, write_json, write_text

@@ -16,7 +16,8 @@ import numpy as np
 
 from dmcvb_gen.benchmarks.evaluate import SPLIT
 from dmcvb_gen.benchmarks.plan import Cell
-from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.inputs import background_source, video_source

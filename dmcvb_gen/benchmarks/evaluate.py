@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dmcvb_gen.dataset import Subset
 from dmcvb_gen.dataset.manifest import MAX_STEPS
 from dmcvb_gen.dataset.pictures import NOT_TRAINED_ON, Pictures, shown
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.files import replacing

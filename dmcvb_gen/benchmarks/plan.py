@@ -22,7 +22,8 @@ from dmcvb_gen.agents.data import HOLD_OUT, Slice
 from dmcvb_gen.agents.learners import PARTS
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.agents.trainer import Budget
-from dmcvb_gen.dataset import Release, Subset
+from dmcvb_gen.dataset.gate import Release
+from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.policies.paper import MAZE_GROUPS, paper_task, read_table
 from dmcvb_gen.registry import Registry

@@ -29,8 +29,8 @@ from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.trainer import Budget
 from dmcvb_gen.benchmarks.checks import Structure, comparable, known_returns, normalized_score
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, Cell, Missing, Results, only, paper_score, plan_benchmark
-from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset.environment import environment
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import STATISTICS, return_statistics

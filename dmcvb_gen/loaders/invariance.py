@@ -10,7 +10,7 @@ import numpy as np
 
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.loaders.paired import PairedReader
+from dmcvb_gen.loaders.release import SubsetReader
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.cameras import nominal_cameras
 
@@ -42,7 +42,7 @@ class Invariance:
 
 
 def evaluate_invariance(
-    pairs: PairedReader,
+    pairs: SubsetReader,
     encoder: Callable[[np.ndarray], Any],
     *,
     states: int = 512,

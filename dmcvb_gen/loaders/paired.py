@@ -7,10 +7,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from dmcvb_gen import loaders
 from dmcvb_gen.dataset.pictures import picture_arrays, picture_of, shown
 from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.loaders.arrays import PairedArray
+from dmcvb_gen.loaders.invariance import evaluate_invariance
 from dmcvb_gen.loaders.painted import RESAMPLED, PaintedSubset, Painting
 from dmcvb_gen.loaders.release import SubsetReader
 from dmcvb_gen.spec import SubsetSpec, subset_name
@@ -55,7 +55,7 @@ class PairedReader(SubsetReader):
         Raises:
           DmcvbError: there are fewer than two episodes.
         """
-        return loaders.evaluate_invariance(self, encoder, **options)
+        return evaluate_invariance(self, encoder, **options)
 
     def set_epoch(self, epoch: int) -> None:
         super().set_epoch(epoch)

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from dmcvb_gen import loaders
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.reader import Subset
@@ -54,7 +53,7 @@ class SubsetReader(Subset):
         Raises:
           DmcvbError: no such setting of this task, or the data were imported and the release does not hold it.
         """
-        return loaders.PairedReader(self, settings)
+        return importlib.import_module("dmcvb_gen.loaders.paired").PairedReader(self, settings)  # it imports this one
 
     def xarray(self, episodes: Iterable[int] | None = None) -> xarray.Dataset:
         """All arrays as one lazy xarray data set.
@@ -109,7 +108,9 @@ class SubsetReader(Subset):
           options: stack (3) frames; split ("val"): "val" shows videos and styles that no data show, "train" the data's;
             num_envs: a vector environment; and those of `DistractedEnv`.
         """
-        return loaders.matching_environment(self, **options)
+        from dmcvb_gen.loaders.matching import matching_environment
+
+        return matching_environment(self, **options)
 
     def evaluate(self, policy: Any, **options: Any) -> Any:
         """Score a policy on fresh episodes like the data's; see `dmcvb_gen.evaluate`, which takes a subset, too.
@@ -153,7 +154,7 @@ class ReleaseReader(Release):
         Raises:
           DmcvbError: they differ in task, setting, size or time limit, or have no episodes here.
         """
-        return loaders.UnionReader(self, [self[name] for name in names])
+        return importlib.import_module("dmcvb_gen.loaders.union").UnionReader(self, [self[name] for name in names])
 
 
 def open_for_reading(path: str | Path, storage_options: dict | None = None, digest: str | None = None) -> ReleaseReader:

@@ -16,8 +16,8 @@ from dmcvb_gen.agents.data import PAD, Slice, TrainingData, batches, load_data, 
 from dmcvb_gen.agents.networks import observation_encoder, state_encoder
 from dmcvb_gen.agents.paper import BehaviorCloning
 from dmcvb_gen.agents.trainer import Budget, draw, hold_out_losses, train
-from dmcvb_gen.dataset import Release
 from dmcvb_gen.dataset import steps as steps_module
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.steps import StepTable
 from dmcvb_gen.errors import DmcvbError
 from tests.conftest import roll_out, short_recipe

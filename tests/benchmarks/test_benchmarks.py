@@ -25,7 +25,7 @@ from dmcvb_gen.benchmarks.cell import CellRun, fingerprint, planned_steps, run_c
 from dmcvb_gen.benchmarks.evaluate import Evaluator, TrainedAgent
 from dmcvb_gen.benchmarks.plan import BENCHMARKS, BUDGETS, Cell, paper_score, plan_benchmark
 from dmcvb_gen.benchmarks.report import _groups, compare, comparison
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import ShardRecord
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError

@@ -26,7 +26,7 @@ from dmcvb_gen.benchmarks.evaluate import load_agent
 from dmcvb_gen.benchmarks.plan import BUDGETS, Cell, goal_cells, only, plan_benchmark
 from dmcvb_gen.benchmarks.report import CHECKS, STATISTICS, _tables, curve_figures, render_page
 from dmcvb_gen.benchmarks.validate import validate
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.manifest import PolicyRecord, record_path
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.references import reference_returns

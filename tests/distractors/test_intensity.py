@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dmcvb_gen
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.spec import ALL_PARTS, DistractorSetting

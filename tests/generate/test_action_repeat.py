@@ -7,7 +7,7 @@ import pytest
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.generate.recipe import Recipe, expand, load_recipe, override
-from dmcvb_gen.loaders import DistractedEnv
+from dmcvb_gen.loaders.envs import DistractedEnv
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy

@@ -21,7 +21,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from dmcvb_gen.dataset import Release
+from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate import engine
 from dmcvb_gen.own_code import BEHAVIOURS, allow, find_function

@@ -13,7 +13,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(ROOT))
 
-from dmcvb_gen.dataset import Release  # noqa: E402
+from dmcvb_gen.dataset.gate import Release  # noqa: E402
 from dmcvb_gen.dataset.pictures import shown  # noqa: E402
 from dmcvb_gen.generate.modalities import all_modalities  # noqa: E402
 from dmcvb_gen.generate.repaint import Repainting, repaint  # noqa: E402
