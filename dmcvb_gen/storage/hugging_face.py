@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -162,13 +161,14 @@ class HubStore(Store):
     def finish(self, contents: Mapping[str, bytes], expected: str | None = ANY) -> bool:
         """In one commit, which the Hub refuses if another one has come since the version was compared."""
         from huggingface_hub import CommitOperationAdd
+        from huggingface_hub.utils.sha import git_hash
 
         *_, last = contents
         with self._errors(last, "write to"):
             head = self._head()
             now = self._known([last], head)
             if expected not in (ANY, now[last].blob_id if last in now else None):
-                return last in now and now[last].blob_id == _blob(contents[last])
+                return last in now and now[last].blob_id == git_hash(contents[last])
             adds = [CommitOperationAdd(self.folder_there + path, data) for path, data in contents.items()]
             self._commit(adds, f"{last} and {len(adds) - 1} files with it", parent_commit=head)
         return True
@@ -206,7 +206,3 @@ class _Known(dict[str, Any]):
 
     def __missing__(self, path: str) -> Any:
         raise FileNotFoundError(path)
-
-
-def _blob(data: bytes) -> str:
-    return hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()
