@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import platform
 from importlib import metadata
@@ -15,7 +16,10 @@ PACKAGES = ("mujoco", "dm-control", "scikit-fmm", "numba", "numpy", "scipy", "za
 @functools.cache
 def environment() -> dict[str, str]:
     """Versions and processor of this process."""
-    versions = {name: version for name in PACKAGES if (version := _version(name))}
+    versions = {}
+    for name in PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):  # one who only reads needs few of them
+            versions[name] = metadata.version(name)
     return {
         "dmcvb-gen": __version__,
         "python": platform.python_version(),
@@ -25,18 +29,9 @@ def environment() -> dict[str, str]:
     }
 
 
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def _cpu_name() -> str:
-    try:
+    with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
     return platform.processor() or "unknown"
