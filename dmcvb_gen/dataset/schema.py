@@ -180,8 +180,7 @@ def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> ArrayV3Metad
     """
     per_shard, rows = layer.episodes_per_shard, layer.rows
     pixel_level = 1 if spec.codec == "channel-delta-zstd" else 3
-    packed = (BoundedZstd(level=pixel_level), Crc32cCodec())
-    array_to_bytes: list[Any] = [*_filters(spec.codec), BytesCodec(), *packed]
+    array_to_bytes = [*_filters(spec.codec), BytesCodec(), BoundedZstd(level=pixel_level), Crc32cCodec()]
     if not spec.steps:
         shape, chunks, codecs = (episodes, *spec.shape), (per_shard, *spec.shape), array_to_bytes
         dims: tuple[str, ...] = ("episode", *spec.dims)
