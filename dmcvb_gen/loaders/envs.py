@@ -247,8 +247,10 @@ class _Stage:
         """Rewards, terminated, truncated of one agent step of the active places.
 
         Raises:
-          DmcvbError: the actions have another shape, or are not finite numbers.
+          DmcvbError: no episode has started, or the actions have another shape, or are not finite numbers.
         """
+        if not self.started.any():
+            raise DmcvbError("step before reset; call reset() first")
         actions, wanted = np.asarray(actions, np.float64), (self.count, self.task.action_size)
         if actions.shape != wanted:
             raise DmcvbError(f"the actions have shape {actions.shape}; {self.task.id} takes shape {wanted}")
@@ -308,8 +310,6 @@ class DistractedEnv(gymnasium.Env):
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict]:
-        if self._seed is None:
-            raise DmcvbError("step before reset; call reset() first")
         if self._ended:
             raise DmcvbError("step after the end of the episode; call reset() first")
         reward, terminated, truncated = self._stage.step([action], np.ones(1, bool))
@@ -351,7 +351,7 @@ class DistractedVectorEnv(VectorEnv):
         self.single_observation_space, self.single_action_space = self._stage.spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._seeds: list[int] | None = None
+        self._seeds: list[int] = []
         self._ended = np.zeros(num_envs, bool)
 
     def reset(
@@ -364,7 +364,7 @@ class DistractedVectorEnv(VectorEnv):
         """
         if options and "reset_mask" in options:
             raise DmcvbError("places restart by themselves, a step after their end; leave reset_mask out")
-        if seed is not None or self._seeds is None:
+        if seed is not None or not self._seeds:
             given = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
             given = [None] * self.num_envs if given is None else [each if each is None else int(each) for each in given]
             if len(given) != self.num_envs:
@@ -376,8 +376,6 @@ class DistractedVectorEnv(VectorEnv):
         return self._stage.observe(), self._info()
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict]:
-        if self._seeds is None:
-            raise DmcvbError("step before reset; call reset() first")
         restarted = self._ended.copy()
         if restarted.any():
             places = np.flatnonzero(restarted)
