@@ -98,11 +98,6 @@ class PaintedSubset(SubsetReader):
         self._start()
 
     @property
-    def picture_names(self) -> tuple[str, ...]:
-        """All arrays that can be painted."""
-        return all_pictures(self.record)
-
-    @property
     def unpainted(self) -> np.ndarray:
         """(episode of the whole subset,) bool: none is without images."""
         return np.zeros(self.record.episodes, bool)
@@ -113,7 +108,7 @@ class PaintedSubset(SubsetReader):
         unlike = set(stored_in(stored)) if self._other_frames else set()
         if self.fresh:
             unlike |= {name for name in stored if re.match(r"exogenous/|at\d+/", name)}
-        return tuple(sorted({*stored, *self.picture_names} - unlike | set(self._fresh_specs)))
+        return tuple(sorted({*stored, *all_pictures(self.record)} - unlike | set(self._fresh_specs)))
 
     def array(self, name: str) -> Any:
         """See `Subset.array`.
@@ -178,7 +173,7 @@ class PaintedSubset(SubsetReader):
         """
         self._check_episode(episode)
         epoch = self.epoch
-        keys = {name: (episode, epoch, name) for name in (self.picture_names if arrays is None else arrays)}
+        keys = {name: (episode, epoch, name) for name in (all_pictures(self.record) if arrays is None else arrays)}
         with self._lock:
             found = {name: self._kept[key] for name, key in keys.items() if key in self._kept}
             missing = [name for name in keys if name not in found]

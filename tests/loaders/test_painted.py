@@ -73,7 +73,7 @@ def test_stored_modalities_are_read_with_their_own_pictures_alone(painted_and_li
 def test_fresh_distractors_are_the_same_alone_and_drawn_together(painted_and_light, monkeypatch):
     opened = [dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="resample") for _ in range(2)]
     together, alone = map(distracted, opened)
-    array, episodes = together.picture_names[0], together.episodes[::-1]
+    array, episodes = together.pixel_arrays[0], together.episodes[::-1]
     batch = together.rows([array], episodes)[array]
     monkeypatch.setattr("dmcvb_gen.loaders.painted.DRAWN_TOGETHER", 1)
     assert len(together._drawn) == len(episodes)
@@ -126,7 +126,7 @@ def test_of_several_threads_one_reads_a_source(painted_and_light, way, monkeypat
 
 def test_painted_episodes_are_kept_while_there_is_room(painted_and_light):
     subset = next(iter(dmcvb_gen.open(str(painted_and_light / "light"), paint=True).subsets.values()))
-    name = subset.picture_names[0]
+    name = subset.pixel_arrays[0]
     assert subset.painted(0, [name])[name] is subset.painted(0)[name]
     subset.array(name)[0][:] = subset.episode(0, [name])[name][:] = 0
     assert subset.painted(0)[name].any()  # what is read is the reader's, and may be changed
