@@ -365,7 +365,7 @@ class _Described(_Model):
     def _one_tree(self) -> Self:
         named = {layer.name: layer for layer in self.layers}
         _check_unique([subset.name for subset in self.subsets], "subsets")
-        _check_unique(list(named), "layers")
+        _check_unique([layer.name for layer in self.layers], "layers")
         places = [f"{layer.group}/{spec.stored_name}" for layer in named.values() for spec in layer.arrays]
         _check_unique(places, "arrays")
         for subset in self.subsets:

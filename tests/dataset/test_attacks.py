@@ -177,6 +177,7 @@ def _infinite(root: Path) -> None:
 
 REFUSED = {
     "more episodes than the 10,000,000": _rewrite_manifest(_many_episodes),
+    "appears twice": _rewrite_manifest(lambda m: m["layers"].append(m["layers"][0])),
     "seconds_per_step": _infinite,
     "renderer.samples": _rewrite_manifest(lambda m: m["subsets"][0].update(renderer={"samples": "\x1b]0;x\x07"})),
 }
