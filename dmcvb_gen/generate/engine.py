@@ -40,20 +40,9 @@ ANY_BITS = ("opengl",)
 """Renderers whose images may differ from machine to machine: the first shard that is put is the release's."""
 
 
-@dataclass(frozen=True)
-class Episodes:
-    """Episodes before they are rendered; rows past an episode's end are zero.
-
-    Attributes:
-      index: (episode,) int, in the set of trajectories.
-      arrays: the values to store, by name; at least "physics", (episode, row, physics) float64, "length" and "action".
-    """
-
-    index: np.ndarray
-    arrays: Mapping[str, np.ndarray]
-
-    physics = property(lambda self: self.arrays["physics"])
-    length = property(lambda self: self.arrays["length"])
+Episodes = Mapping[str, np.ndarray]
+"""Episodes of a work before they are rendered: arrays by name, at least "physics", (episode, row, physics) float64,
+"length" and "action". Rows past an episode's end are zero."""
 
 
 @dataclass(frozen=True)
@@ -139,16 +128,15 @@ def run_work(work: Work, threads: int = 1, tick: ProgressCallback = ignore) -> W
     check_task_code(first.task, work.trajectories)  # its model is painted, too
     if work.trajectories.name in work.make:
         episodes = simulated_episodes(work, first, threads)
-        outcomes = [_settle(work, work.trajectories, episodes.arrays.items())]
+        outcomes = [_settle(work, work.trajectories, episodes.items())]
     else:
-        arrays = read_shard(work, work.trajectories, ("physics", "length", "action"))
-        episodes, outcomes = Episodes(np.asarray(work.episodes), arrays), []
+        episodes, outcomes = read_shard(work, work.trajectories, ("physics", "length", "action")), []
     if not work.images:
-        tick(int((episodes.length + 1).sum()))
+        tick(int((episodes["length"] + 1).sum()))
     for setting in work.settings:
         outcomes += _make_setting(work, setting, episodes, tick)
     count = len(work.settings)
-    return WorkResult(tuple(outcomes), count * len(episodes.index), count * int(episodes.length.sum()))
+    return WorkResult(tuple(outcomes), count * len(work.episodes), count * int(episodes["length"].sum()))
 
 
 def _make_setting(work: Work, setting: Setting, episodes: Episodes, tick: ProgressCallback) -> Iterator[ShardOutcome]:
@@ -162,7 +150,7 @@ def _make_setting(work: Work, setting: Setting, episodes: Episodes, tick: Progre
     if makes_labels:
         check_code(record.distractor.kind, setting.labels.makes, code_of_distractor(record.distractor))
         labels = _drawn_labels(work, record, episodes, backgrounds)
-        yield _settle(work, setting.labels, label_arrays(labels, episodes.length, work.trajectories.rows))
+        yield _settle(work, setting.labels, label_arrays(labels, episodes["length"], work.trajectories.rows))
     else:
         labels = _stored_labels(work, setting.labels, episodes)
     for size in dict.fromkeys(layer.arrays[0].shape[0] for layer in images):
@@ -190,7 +178,7 @@ def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episod
         pairs = fixed_pairs(as_maze(task).layout, makes["fixed_goals"], makes["seed"])
         pairs = pairs * (-(-work.episodes.stop // (per_goal * len(pairs))))  # the last shard is full, too
     files = policy_files(local_inputs(work.store, work.inputs), record)
-    made = simulate(
+    return simulate(
         task,
         _policies(record.task, files, tuple(policy.digest for policy in record.policies)),
         list(work.episodes),
@@ -201,8 +189,7 @@ def simulated_episodes(work: Work, record: SubsetRecord, threads: int) -> Episod
         episodes_per_goal=makes["episodes_per_goal"],
         threads=threads,
         max_steps=record.max_steps,
-    )
-    return Episodes(made.episodes, made.arrays())
+    ).arrays()
 
 
 @functools.lru_cache(maxsize=4)
@@ -225,14 +212,14 @@ def _policies(task_name: str, files: tuple[str, ...], digests: tuple[str, ...]) 
 
 def _drawn_labels(work: Work, record: SubsetRecord, episodes: Episodes, backgrounds: str) -> DistractorState:
     videos = videos_of(record.distractor, backgrounds, record.split)
-    streams = (work.trajectories.makes["seed"], tuple(work.trajectories.makes["streams"]), episodes.index)
-    return distractor_state_of(record, *streams, episodes.physics, episodes.length, videos, episodes.arrays["action"])
+    streams = (work.trajectories.makes["seed"], tuple(work.trajectories.makes["streams"]), work.episodes)
+    return distractor_state_of(record, *streams, episodes["physics"], episodes["length"], videos, episodes["action"])
 
 
 def _stored_labels(work: Work, layer: Layer, episodes: Episodes) -> DistractorState:
     arrays = read_shard(work, layer, [spec.name for spec in layer.arrays])
     arrays = {name.removeprefix("exogenous/"): values for name, values in arrays.items()}
-    return DistractorState(**arrays)[:, : int(episodes.length.max()) + 1]
+    return DistractorState(**arrays)[:, : int(episodes["length"].max()) + 1]
 
 
 def read_shard(work: Work, layer: Layer, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -262,9 +249,9 @@ def _rendered(
     tick: ProgressCallback,
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Image arrays of one size, one at a time: (plain name, (episode, row, ...))."""
-    task, length, rows = get_task(record.task), episodes.length, episodes.physics.shape[1]
+    task, length, rows = get_task(record.task), episodes["length"], episodes["physics"].shape[1]
     renderer = renderers.get(record, backgrounds)
-    physics = episodes.physics[:, : labels.background_video.shape[1]]
+    physics = episodes["physics"][:, : labels.background_video.shape[1]]
     modalities: dict[str, list[str]] = {}
     for name, layer in layers.items():
         if modality := layer.makes.get("modality"):

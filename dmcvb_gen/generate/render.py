@@ -101,7 +101,7 @@ def distractor_state_of(
     record: SubsetRecord,
     seed: int,
     names: tuple[str, ...],
-    episodes: np.ndarray,
+    episodes: Sequence[int],
     physics: np.ndarray,
     length: np.ndarray,
     backgrounds: Any,
@@ -111,7 +111,7 @@ def distractor_state_of(
 
     Args:
       seed, names: seed and names of the episodes' streams.
-      episodes: (episode,) indices in the subset.
+      episodes: indices in the subset.
       physics: (episode, row, physics) float64.
       length: (episode,) transitions of each.
       backgrounds: the videos, None if the distractor shows none.
@@ -123,7 +123,7 @@ def distractor_state_of(
     padded = physics[:, :rows].copy()
     last = physics[np.arange(len(physics)), length]
     padded[after] = np.repeat(last, after.sum(axis=1), axis=0)  # a state that MuJoCo can be put into
-    generators = {name: [episode_stream(seed, names, int(i), name) for i in episodes] for name in DISTRACTOR_STREAMS}
+    generators = {name: [episode_stream(seed, names, i, name) for i in episodes] for name in DISTRACTOR_STREAMS}
     setting = record.distractor
     before = np.zeros((len(padded), rows, task.action_size))
     before[:, 1:] = action[:, : rows - 1]

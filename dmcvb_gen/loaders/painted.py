@@ -229,7 +229,7 @@ class PaintedSubset(SubsetReader):
 
     def _fresh_labels(self, episodes: list[int], physics: np.ndarray, length: np.ndarray) -> DistractorState:
         names, (_, videos) = (*self.trajectories.makes["streams"], f"epoch {self.epoch}"), self._painter
-        streams = (self.record, int(self.trajectories.makes["seed"]), names, np.array(episodes))
+        streams = (self.record, int(self.trajectories.makes["seed"]), names, episodes)
         return distractor_state_of(*streams, physics, length, videos, self.read("action", episodes))
 
     def _videos(self) -> str:
