@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import _thread
-import difflib
 import importlib
 import logging
 import signal
@@ -15,7 +14,7 @@ from typing import NoReturn
 import click
 
 from dmcvb_gen.cli.common import INTERRUPTED
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, UnknownNameError
 from dmcvb_gen.extras import install_hint
 from dmcvb_gen.options import at_terminal
 from dmcvb_gen.text import printable
@@ -70,16 +69,9 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx, name):
         if name not in COMMANDS:
-            return None
+            raise UnknownNameError("command", name, COMMANDS)
         module, attribute = COMMANDS[name][0].split(":")
         return getattr(importlib.import_module(f"dmcvb_gen.cli.{module}"), attribute)
-
-    def resolve_command(self, ctx, args):
-        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
-            hint = f"Did you mean {near[0]!r}?" if near else "`dmcvb-gen --help` lists the commands."
-            ctx.fail(f"unknown command {args[0]!r}. {hint}")
-        return super().resolve_command(ctx, args)
 
     def make_context(self, *args, **kwargs):
         try:
@@ -138,10 +130,6 @@ _asked_to_stop = threading.Event()
 def _wrong_usage(error: click.UsageError) -> str:
     """Say in one line what is wrong with a command line. Messages of click get the help to read; ours name the cure."""
     command = error.ctx.command_path if error.ctx else "dmcvb-gen"
-    if isinstance(error, click.NoSuchOption):
-        near = difflib.get_close_matches(error.option_name, error.possibilities or [], n=1)
-        hint = f"Did you mean {near[0]!r}?" if near else f"`{command} --help` lists the options."
-        return f"unknown option {error.option_name!r}. {hint}"
     ours = type(error) is click.UsageError and not error.message.startswith("Got unexpected")
     message = error.format_message().rstrip(".")
     message = message[:1].lower() + message[1:]

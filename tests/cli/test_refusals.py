@@ -24,7 +24,7 @@ ROLLOUTS = [
     ("ant-maze-empty", "Did you mean 'ant-maze-empty7x7'?"),
     ("walker-walk --level expert,medium", "unknown level 'expert,medium'"),
     (f"{TINY_MAZE} --level randm", "Did you mean 'random'?"),
-    ("walker-walk --distracter none", "Did you mean '--distractor'?"),
+    ("walker-walk --distracter none", "--distractor"),
     ("walker-walk --distractor static_cue0.5", "has no cue or light"),
     ("walker-walk --distractor math:Nothing", "cannot find distractor math:Nothing"),
     ("walker-walk --distractor dis:Base", "dis.py has no 'Base'; if that is not your file, rename yours"),
@@ -50,7 +50,7 @@ ROLLOUTS = [
     ("walker-walk --behaviour mine.py", "is a file; in its folder, give mine:FUNCTION"),
     ("walker-walk --behaviour mine.py:swing", "is a file; in its folder, give mine:swing"),
     ("--recipe dmcvb-mni", "Did you mean 'dmcvb-mini'?"),
-    ("--zzz", "`dmcvb-gen rollout --help` lists the options"),
+    ("--zzz", "see `dmcvb-gen rollout --help`"),
     ("hole.txt", "hole"),
     ("no-such.txt", "cannot read layout no-such.txt"),
     ("ring.txt --level expert", "`dmcvb-gen train-behaviour ring.txt`, then give --behaviour runs/ring"),
@@ -73,7 +73,7 @@ ROLLOUTS = [
     ("--recipe dmcvb-mini walker-walk --level random --sample", "level random is always drawn"),
 ]
 OTHERS = [
-    ("--fast", "`dmcvb-gen --help` lists the options"),
+    ("--fast", "see `dmcvb-gen --help`"),
     ("rolout", "Did you mean 'rollout'?"),
     ("info", "see `dmcvb-gen info --help`"),
     ("rollout walker-walk --level", "see `dmcvb-gen rollout --help`"),
