@@ -48,17 +48,15 @@ Split = Literal["train", "val"]
 at_terminal = contextvars.ContextVar("at_terminal", default=False)
 """Whether a command runs, whose messages name flags; messages of functions name their parameters."""
 _FLAG = re.compile(r"`[^`]*`|dmcvb-gen [^;,(]*|--(?P<name>[a-z][a-z-]*)")
-_PARAMETERS = {
-    "all": "everything",
+FLAGS = {"settings": "set", "storage_options": "option", "everything": "all", "episode_range": "range"}
+"""Parameter -> flag, if it has another name."""
+_PARAMETERS = {flag: parameter for parameter, flag in FLAGS.items()} | {
     "benchmark": "benchmarks",
     "distractor": "distractors",
     "goal": "goals",
     "label": "labels",
     "level": "levels",
     "no-pixels": "pixels=False",
-    "option": "storage_options",
-    "range": "episode_range",
-    "set": "settings",
 }
 """Flags whose parameters have other names."""
 

@@ -23,13 +23,11 @@ from typing import Any, Literal
 import click
 
 from dmcvb_gen.cli.common import GroupedCommand, json_option, parse_options
-from dmcvb_gen.options import PLACE, parts_of
+from dmcvb_gen.options import FLAGS, PLACE, parts_of
 from dmcvb_gen.parallel import Ray, Workers
 
 METAVARS = {"RANGE": "A:B", "BEHAVIOUR": "FILE|RUN|MODULE:FUNCTION"}
 """What stands for a metavar with a colon, which would end the name in a docstring."""
-FLAGS = {"settings": "set", "storage_options": "option", "everything": "all", "episode_range": "range"}
-"""Parameter -> flag, if it has another name."""
 
 
 def command_of(
