@@ -29,22 +29,19 @@ class ProgressBar(tqdm):
             options |= dict(file=_Lines(), delay=LOG_SECONDS, mininterval=LOG_SECONDS, miniters=1, bar_format=line)
         super().__init__(disable=not shown, **options)
 
-    def __call__(self, done: int | str = 1) -> None:
-        """Progress callback: how much was done since the last call, or the name of the item in progress."""
+    def __call__(self, done: int | str = 1, steps: int = 1) -> None:
+        """Progress callback: how much was done since the last call; or the name of the item in progress, and how much.
+
+        With nothing done, the name alone is shown.
+        """
         if isinstance(done, str):
-            self.set_description(done, refresh=False)
-        self.update(1 if isinstance(done, str) else done)
+            self.set_description(done, refresh=not steps)
+            done = steps
+        self.update(done)
 
     def expect(self, count: float) -> None:
         """Set the expected total, which may change later."""
         self.total = count
-
-    def advance(self, what: str, steps: int) -> None:
-        """Name the item in progress, and count steps. With none, the name alone is shown."""
-        self.set_description(what, refresh=False)
-        self.update(steps)
-        if not steps:
-            self.refresh()
 
     def refresh(self, *args: Any, **options: Any) -> bool | None:
         if self._logged:

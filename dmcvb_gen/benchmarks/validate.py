@@ -128,7 +128,7 @@ def validate(
         if structure.sound or train_unsound:
             bar.unit = " steps"
             bar.reset(planned_steps(budget, cells))
-            for cell, result in run_cells(release, folder, budget, cells, workers, bar.advance):
+            for cell, result in run_cells(release, folder, budget, cells, workers, bar):
                 on_score(budget, cell, result)
                 results.append((cell, result))
     results.sort(key=lambda pair: cells.index(pair[0]))
