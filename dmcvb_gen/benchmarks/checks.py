@@ -21,7 +21,7 @@ from dmcvb_gen.dataset.reader import Subset
 from dmcvb_gen.distractors import load_backgrounds
 from dmcvb_gen.errors import BackgroundError, StoreError
 from dmcvb_gen.generate.inputs import background_source, video_source
-from dmcvb_gen.generate.paint import render_differences
+from dmcvb_gen.generate.paint import render_differences, rendered_here
 from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.loaders.painted import PaintedSubset
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore, in_order, open_pool
@@ -149,8 +149,8 @@ def known_returns(release: Release) -> dict[str, np.ndarray]:
 def _painter_drift(release: Release, backgrounds: str | None) -> Iterator[Issue]:
     """Warn of versions that differ from those for which the pictures rendered on reading are promised."""
     painted = [subset.record for subset in release.subsets.values() if isinstance(subset, PaintedSubset)]
-    sources = {record.name: background_source(release.path, record, backgrounds) for record in painted}
-    for text in render_differences(release, painted, sources):
+    here = [rendered_here(record, background_source(release.path, record, backgrounds)) for record in painted]
+    for text in render_differences(release, here):
         yield Issue("painter", "images painted on reading", text)
 
 

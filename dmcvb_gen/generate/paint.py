@@ -109,8 +109,8 @@ def paint_release(
     records = not_imported(release, chosen_subsets(release, only))
     check_videos_shown(records, backgrounds)
     root = local_inputs(store, release.inputs_of([record.name for record in records]))
-    sources = {record.name: background_source(root, record, backgrounds) for record in records}
-    layers = {record.name: _layers_of(release, record, wanted, sources[record.name]) for record in records}
+    here = [rendered_here(record, background_source(root, record, backgrounds)) for record in records]
+    layers = {record.name: _layers_of(release, record, wanted) for record in here}
     below = {layer.name: _labels(release, record).name for record in records for layer in layers[record.name]}
     if below.keys() - release.layers.keys():
         begin(store, _recipe_with(release, records, layers), {})
@@ -121,7 +121,7 @@ def paint_release(
         return labels is not None and shard in release.here(labels) and can_be_rendered(release, layer, shard)
 
     works = works_of(release, [record.name for record in records], episodes, is_missing, backgrounds=backgrounds)
-    drift = render_differences(release, records, sources) if works else ()
+    drift = render_differences(release, here) if works else ()
     for text in drift:
         _log.warning(printable(text, " "))
     if works:
@@ -147,10 +147,9 @@ def not_imported(release: Release, records: Iterable[SubsetRecord]) -> list[Subs
     return own
 
 
-def _layers_of(release: Release, record: SubsetRecord, wanted: Wanted, source: str) -> list[Layer]:
+def _layers_of(release: Release, record: SubsetRecord, wanted: Wanted) -> list[Layer]:
     """The image layers that are asked for of a subset: the release's own, or new ones of the renderer here."""
-    here = record.model_copy(update=rendering_facts(record, source))
-    asked = image_layers(here, _labels(release, record), wanted.pictures(record), wanted.size)
+    asked = image_layers(record, _labels(release, record), wanted.pictures(record), wanted.size)
     return [release.layers.get(layer.name, layer) for layer in asked]
 
 
@@ -182,24 +181,27 @@ def bare(layer: Layer) -> Layer:
     return Layer(**layer_facts(layer))
 
 
-def render_differences(
-    release: Release, records: Iterable[SubsetRecord], backgrounds: Mapping[str, str]
-) -> tuple[str, ...]:
+def rendered_here(record: SubsetRecord, source: str) -> SubsetRecord:
+    """The record of a subset that is painted here, from videos at `source`."""
+    return record.model_copy(update=rendering_facts(record, source))
+
+
+def render_differences(release: Release, records: Iterable[SubsetRecord]) -> tuple[str, ...]:
     """List what may change pixels here compared with the release's origin: versions, processor, renderer.
 
     Args:
-      records: records of the subsets to paint.
-      backgrounds: videos of each, by name.
+      records: of the subsets to paint, see `rendered_here`.
     """
     found: dict[str, None] = {}
+    made = {record.name: record.renderer for record in release.manifest.subsets}
     for record in records:
-        here = rendering_facts(record, backgrounds[record.name])["renderer"]
-        for name in sorted(set(here) | set(record.renderer)):
-            was, now = record.renderer.get(name, "nothing"), here.get(name, "nothing")
+        there, here = made[record.name], record.renderer
+        for name in sorted(set(here) | set(there)):
+            was, now = there.get(name, "nothing"), here.get(name, "nothing")
             if was != now:
-                found[f"{record.renderer['name']}'s {name} is {now} here, {was} in the manifest"] = None
-    for name, (there, now) in environment_diff(release.store).items():
-        found[f"{name} is {now} on this machine and was {there} on the machine of the release"] = None
+                found[f"{here['name']}'s {name} is {now} here, {was} in the manifest"] = None
+    for name, (old, now) in environment_diff(release.store).items():
+        found[f"{name} is {now} on this machine and was {old} on the machine of the release"] = None
     return tuple(found)
 
 
