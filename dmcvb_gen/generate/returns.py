@@ -8,6 +8,7 @@ from annotated_types import Ge
 
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.options import Location, Names, Seed, checked, refuse
+from dmcvb_gen.own_code import is_own
 from dmcvb_gen.spec import Level
 from dmcvb_gen.text import as_names
 
@@ -42,7 +43,6 @@ def evaluate_behaviour(
     """
     from dmcvb_gen.generate.info import return_statistics  # here, so that --help is quick
     from dmcvb_gen.generate.request import behaviour_source
-    from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.archives import bundled_digests
     from dmcvb_gen.policies.bundled import bundled_levels
     from dmcvb_gen.policies.evaluation import goal_scores
@@ -52,7 +52,11 @@ def evaluate_behaviour(
 
     behaviour, typed = behaviour_source(behaviour), tuple(map(typed_task, as_names(tasks)))
     named = tuple(dict.fromkeys(as_names(levels)))
-    _check_levels(named, behaviour, sample)
+    for level in named:
+        Level.parse(level)
+    if set(named) == {Level.RANDOM}:
+        refuse("level random has no policy", behaviour=behaviour)
+        refuse("level random is always drawn", sample=sample)
     refuse("a function of your own draws by itself", sample=sample and is_own(behaviour or ""))
     chosen, asked = _of_behaviour(behaviour, typed, named) if behaviour else (typed, named)
     if not chosen:
@@ -76,20 +80,8 @@ def evaluate_behaviour(
     return rows
 
 
-def _check_levels(levels: Sequence[str], behaviour: str | None, sample: bool) -> None:
-    for level in levels:
-        Level.parse(level)
-    if set(levels) != {Level.RANDOM}:
-        return
-    if behaviour:
-        raise DmcvbError("--behaviour has no effect: level random has no policy; ask for another, or remove it")
-    if sample:
-        raise DmcvbError("--sample has no effect: level random is always drawn; ask for another, or remove it")
-
-
 def _of_behaviour(behaviour: str, tasks: Sequence[str], levels: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
     """The tasks and levels to evaluate; those that are not asked for are what the policy says."""
-    from dmcvb_gen.own_code import is_own
     from dmcvb_gen.policies.bundled import is_foreign, levels_of, resolve_policies
     from dmcvb_gen.policies.policy_file import read_header
 
