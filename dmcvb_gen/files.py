@@ -179,12 +179,6 @@ def write_json(path: str | Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 
-def copy_file(source: str | Path, target: str | Path) -> None:
-    """Copy a file so that `target` is whole or not there, see `write_bytes`."""
-    with replacing(target) as temporary:
-        shutil.copyfile(source, temporary)
-
-
 @contextlib.contextmanager
 def folder_in_the_making(parent: str | Path, name: str) -> Iterator[Path]:
     """A fresh folder in `parent` for files that will be moved to where they belong; it is gone when the block ends.

@@ -19,7 +19,7 @@ import torch
 from pydantic import Field
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import copy_file
+from dmcvb_gen.files import write_bytes
 from dmcvb_gen.policies.actor import Policy
 from dmcvb_gen.policies.bundled import resolve_policies
 from dmcvb_gen.policies.header import MAX_LAYERS, WAY_SIZE, Width
@@ -217,7 +217,7 @@ def train(run: Run) -> None:
     """Train until the run's last step, or until it is stopped."""
     base, settings = base_policy(run), run.settings
     if not (kept := run.folder / "resume" / BASE_POLICY).exists():
-        copy_file(_base_file(run), kept)
+        write_bytes(kept, _base_file(run).read_bytes())
     student, saved = Student(run, base), run.saved()
     episodes = Episodes(run.task, settings, run.config.seed, student.rng)
 
