@@ -74,7 +74,7 @@ def roll_out(recipe, folder, works=lambda works: works, workers=1, only=(), pixe
     start(plan)
     for _ in run_works(works(plan.works), workers):
         pass
-    return finish(plan.store)
+    return finish(plan.release.store)
 
 
 TINY_MAZE = "ant-maze-tiny:****/*..*/****"

@@ -86,10 +86,10 @@ def begin(as_json, progress, other_versions, **options):
 
     plan = _plan(options | {"only": (), "episode_range": None})
     start(plan, other_versions, command="cluster begin")
-    place = quoted(plan.store.place)
+    place = quoted(plan.release.place)
     same = " (with the same --option)" if options["storage_options"] else ""
     begun = f"begun, {pluralize(len(plan.works), 'shards')} to make: dmcvb-gen cluster part {place} 1/N to N/N{same}"
-    answer(as_json, {"out": plan.store.place, "shards": len(plan.works)}, f"{plan.store.place}: {begun}")
+    answer(as_json, {"out": plan.release.place, "shards": len(plan.works)}, f"{plan.release.place}: {begun}")
 
 
 @command_of(making.rollout, only=("only", "episode_range", "workers", "storage_options", "other_versions"))
@@ -160,7 +160,7 @@ def _run(plan, workers, as_json, then=None):
     with progress_bar(not as_json, f" {plan.unit}", plan.release.manifest.name) as bar:
         started = time.monotonic()
         release, steps = run_plan(plan, workers, bar, finishing=not then)
-    seconds, place = time.monotonic() - started, plan.store.place
+    seconds, place = time.monotonic() - started, plan.release.place
     complete = not then and not release.unfinished
     facts = dict(out=place, complete=complete, digest=release.digest, steps=steps, seconds=round(seconds, 2))
     named = quoted(place)
@@ -179,7 +179,7 @@ def _show_plan(plan, as_json):
 
     counts = count(plan)
     left, frames, raw = (sum(getattr(subset, name) for subset in counts) for name in ("left", "frames", "raw_bytes"))
-    facts = dict(out=plan.store.place, shards=len(plan.works), episodes=left, frames=frames, raw_bytes=raw)
+    facts = dict(out=plan.release.place, shards=len(plan.works), episodes=left, frames=frames, raw_bytes=raw)
     if as_json:
         return print_json(facts | dict(subsets=[dataclasses.asdict(subset) for subset in counts]))
     print_table(
@@ -187,7 +187,7 @@ def _show_plan(plan, as_json):
         [(c.name, f"{c.done:,}", f"{c.left:,}", f"{c.frames:,}", format_bytes(c.raw_bytes)) for c in counts],
         title=f"Plan of {plan.release.manifest.name} {plan.release.manifest.version}",
     )
-    click.echo(f"release: {plan.store.place}")
+    click.echo(f"release: {plan.release.place}")
     click.echo(
         f"{pluralize(len(plan.works), 'shards')} to make; {pluralize(left, 'episodes')}, {frames:,} images, at most "
         f"{format_bytes(raw)} before compression"

@@ -55,8 +55,9 @@ def count(plan: Plan) -> tuple[SubsetCount, ...]:
 def check_room(plan: Plan) -> None:
     """Raises StoreError if what a plan makes cannot fit on the disk of its folder, however well it is compressed."""
     needed = LEAST_SHARE * sum(subset.raw_bytes for subset in count(plan))
-    if plan.store.folder and needed > (free := free_bytes(plan.store.folder)):
+    folder = plan.release.store.folder
+    if folder and needed > (free := free_bytes(folder)):
         raise StoreError(
-            f"at least {format_bytes(needed)} are needed and {format_bytes(free)} are free at {plan.store.place}; "
+            f"at least {format_bytes(needed)} are needed and {format_bytes(free)} are free at {folder}; "
             "make room, choose another --out or fewer --episodes"
         )

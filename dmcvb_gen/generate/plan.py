@@ -41,11 +41,6 @@ class Plan:
     there: bool
 
     @property
-    def store(self) -> Store:
-        """Where the release lies."""
-        return self.release.store
-
-    @property
     def unit(self) -> str:
         """What a progress bar counts: frames, or steps if no images are rendered."""
         return "frames" if any(work.images for work in self.works) else "steps"
@@ -133,11 +128,11 @@ def start(plan: Plan, other_versions: bool = False, command: str = "rollout") ->
       StoreError: what is there contradicts this recipe or was begun with other versions, or it cannot be written.
     """
     if plan.works and plan.there and not other_versions:
-        check_versions(plan.store)
+        check_versions(plan.release.store)
     if plan.resolution is not None:
-        begin(plan.store, plan.resolution.resolved, plan.resolution.files)
+        begin(plan.release.store, plan.resolution.resolved, plan.resolution.files)
     if plan.works or not plan.there:
-        write_provenance(plan.store, command)
+        write_provenance(plan.release.store, command)
 
 
 def run_plan(
@@ -158,4 +153,4 @@ def run_plan(
       StoreError: the disk is full, or another machine has put other bytes.
     """
     steps = sum(result.steps for result in run_works(plan.works, workers, progress))
-    return finish(plan.store) if finishing else plan.release, steps
+    return finish(plan.release.store) if finishing else plan.release, steps

@@ -58,7 +58,7 @@ def test_a_range_of_episodes_made_alone_gives_the_same_records(small_release, tm
     assert [(work.shard, len(work.settings)) for work in plan.works] == [(1, 1)]
     start(plan)
     list(run_works(plan.works))
-    made, whole = Release.in_making(plan.store), Release.open(small_release)
+    made, whole = Release.in_making(plan.release.store), Release.open(small_release)
     for layer in whole[NAME].record.layers:
         assert made.records(layer) == {1: whole.records(layer)[1]}
 
