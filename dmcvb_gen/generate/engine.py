@@ -262,7 +262,7 @@ def _rendered(
     for modality, names in modalities.items():
         views = [view for view in record.views if names == [modality] or f"{modality}/{view}" in names]
         hidden = layers[names[0]].makes["hidden_goal"]
-        yield from paint_labels(task, renderer, physics, labels, length, rows, modality, hidden, views)
+        yield from paint_labels(renderer, physics, labels, length, rows, modality, hidden, views)
 
 
 # -- what becomes of a layer's arrays -------------------------------------------------------------

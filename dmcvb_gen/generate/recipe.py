@@ -152,11 +152,6 @@ class SubsetRequest(_Model):
     deterministic: bool = False
     episodes_per_goal: int | None = None
 
-    @property
-    def spec(self) -> SubsetSpec:
-        """Its typed identity."""
-        return SubsetSpec.parse(self.task, self.level, self.setting)
-
 
 def expand(recipe: Recipe) -> tuple[SubsetRequest, ...]:
     """All subsets that a recipe asks for, in its order.

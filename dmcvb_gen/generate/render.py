@@ -15,7 +15,6 @@ from dmcvb_gen.dataset.manifest import SubsetRecord
 from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import Backgrounds, floor_alpha_for, load_backgrounds, sample_distractors
-from dmcvb_gen.errors import RenderingError
 from dmcvb_gen.generate.modalities import Modality, Seen, get_modality
 from dmcvb_gen.parallel import ProgressCallback, ignore
 from dmcvb_gen.rendering import renderer_class
@@ -31,12 +30,6 @@ MOST_RENDERERS = 4
 """Renderers of a task that a process keeps."""
 LABEL_FRAMES = 512
 """Frames of depth, segmentation or flow that are rendered at once."""
-
-
-def check_renderer(name: str) -> None:
-    """Raises an error when a renderer is unknown or cannot start here. The others are not tried: OpenGL takes long."""
-    if reason := renderer_class(name).unavailable():
-        raise RenderingError(f"renderer {name!r} cannot start here: {reason}")
 
 
 def open_renderer(
@@ -203,7 +196,6 @@ def look(
 
 
 def paint_labels(
-    task: Task,
     renderer: Renderer,
     physics: np.ndarray,
     exogenous: DistractorState,

@@ -20,7 +20,6 @@ from dmcvb_gen.errors import RecipeError, StoreError
 from dmcvb_gen.generate.executors import run_works
 from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files, whose_videos
 from dmcvb_gen.generate.paint import bare, not_imported, recipe_after
-from dmcvb_gen.generate.render import check_renderer
 from dmcvb_gen.generate.resolve import (
     all_pictures,
     file_records,
@@ -33,7 +32,6 @@ from dmcvb_gen.generate.resolve import (
 from dmcvb_gen.generate.works import can_be_rendered, works_of
 from dmcvb_gen.options import refuse
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
-from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.spec import DistractorSetting, is_maze
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.storage.store import Store, open_store
@@ -125,10 +123,6 @@ def _source(request: Repainting) -> Release:
         raise StoreError(f"--out {request.out} is the release itself; give another folder")
     if not release.subsets:
         raise StoreError(f"{request.root} has no finished episodes yet; run the rollout first")
-    if request.size is not None:
-        check_size(request.size)
-    if request.renderer:
-        check_renderer(request.renderer)
     return release
 
 
@@ -147,7 +141,7 @@ def _repainted(
     changes: dict[str, Any] = {
         "name": f"{old.name.rpartition('/')[0]}/{setting}",
         "setting": setting,
-        "size": request.size or old.size,
+        "size": old.size if request.size is None else request.size,
         "split": request.split or old.split,
         "renderer": {"name": backend, "samples": samples},
     }

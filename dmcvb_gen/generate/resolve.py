@@ -43,13 +43,13 @@ from dmcvb_gen.errors import BackgroundError, RecipeError, StoreError
 from dmcvb_gen.generate.inputs import BUILTIN
 from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.recipe import DEFAULT_EPISODES_PER_SHARD, NATIVE, Recipe, SubsetRequest, expand
-from dmcvb_gen.generate.render import check_renderer, renderer_for
+from dmcvb_gen.generate.render import renderer_for
 from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.own_code import is_own, source_digest
 from dmcvb_gen.policies.bundled import check_level, resolve_policies
 from dmcvb_gen.policies.header import OWN_CODE, PolicyHeader
 from dmcvb_gen.policies.policy_file import load_policy
-from dmcvb_gen.spec import SPLITS, DistractorSetting, is_maze
+from dmcvb_gen.spec import SPLITS, DistractorSetting, SubsetSpec, is_maze
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.tasks.ant_maze import as_maze, fixed_pairs
 from dmcvb_gen.tasks.base import Task
@@ -87,7 +87,8 @@ def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -
     recipe = with_renderer(recipe, requests, there)
     sets: dict[str, list[SubsetRequest]] = {}
     for request in requests:
-        sets.setdefault(set_name(request, recipe.trajectories), []).append(request)
+        alone = recipe.trajectories == "independent" or is_maze(request.task)  # mazes have both kinds of images
+        sets.setdefault(request.name if alone else request.name.rpartition("/")[0], []).append(request)
     looks: dict[tuple, dict[str, Any]] = {}
     files: dict[str, Path] = {}
     layers: dict[str, Layer] = {}
@@ -127,11 +128,7 @@ def resolve(recipe: Recipe, there: Release | None = None, pixels: bool = True) -
 
 
 def with_renderer(recipe: Recipe, requests: Iterable[SubsetRequest], there: Release | None) -> Recipe:
-    """The recipe with a renderer: its own, else that of a release that was begun, else what draws its tasks best.
-
-    Raises:
-      RenderingError: that renderer cannot start here.
-    """
+    """The recipe with a renderer: its own, else that of a release that was begun, else what draws its tasks best."""
     tasks = dict.fromkeys(request.task for request in requests)
     backend = recipe.renderer.backend
     if backend is None and there is not None:
@@ -140,18 +137,7 @@ def with_renderer(recipe: Recipe, requests: Iterable[SubsetRequest], there: Rele
     if backend is None:
         chosen = [default_renderer(get_task(task)) for task in tasks]
         backend = next((name for name in chosen if name != NATIVE), NATIVE)
-    check_renderer(backend)
     return recipe.model_copy(update={"renderer": recipe.renderer.model_copy(update={"backend": backend})})
-
-
-def set_name(request: SubsetRequest, trajectories: str) -> str:
-    """Name of the set of trajectories of a subset: of its task and level, or its own.
-
-    Args:
-      trajectories: the recipe's "shared" or "independent"; mazes have both kinds of images, and share none.
-    """
-    shared = trajectories == "shared" and not is_maze(request.task)
-    return request.name.rpartition("/")[0] if shared else request.name
 
 
 def file_records(files: Mapping[str, Path]) -> tuple[FileRecord, ...]:
@@ -320,7 +306,7 @@ def _record(recipe: Recipe, request: SubsetRequest, files: Sequence[Path]) -> Su
         renderer={"name": recipe.renderer.backend, "samples": recipe.renderer.samples},
         family=task.family,
         views=tuple(task.views),
-        hidden_goal=bool(task.goal_geoms) and request.spec.hides_goal,
+        hidden_goal=bool(task.goal_geoms) and SubsetSpec.parse(request.task, request.level, request.setting).hides_goal,
         action_repeat=recipe.action_repeat,
         seconds_per_step=task.seconds_per_step,
         fixed_goals=goals,

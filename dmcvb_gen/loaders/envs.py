@@ -24,10 +24,9 @@ from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import DistractorSampler
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.generate.modalities import get_modality
-from dmcvb_gen.generate.render import check_renderer, look, open_renderer
+from dmcvb_gen.generate.render import look, open_renderer
 from dmcvb_gen.generate.request import background_source
 from dmcvb_gen.options import naming_parameters
-from dmcvb_gen.rendering.base import check_size
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import VISIBLE, GoalMode, SubsetSpec, is_maze
 from dmcvb_gen.tasks import Task, get_task
@@ -147,8 +146,6 @@ class _Stage:
         self.max_steps = scene.max_steps or self.task.evaluation_steps
         self.pairs = _pairs(self.task, scene) if spec.goal is GoalMode.FIXED else None
         self._first_pair = scene.goal_pair or 0
-        check_size(scene.size)
-        check_renderer(scene.renderer)
         given = (scene.renderer, scene.size, scene.samples, background_source(scene.backgrounds), scene.split)
         self.renderer, self.backgrounds = open_renderer(self.task, self.setting, *given)
         shown = self.backgrounds.digest if self.backgrounds and self.split == "train" else scene.own_videos
