@@ -28,16 +28,14 @@ class RayPool(Pool):
       threads: threads of the libraries that a piece of work uses.
 
     Raises:
-      DmcvbError: ray is not installed, or no cluster answers at the address.
+      DmcvbError: no cluster answers at the address.
     """
 
     def __init__(
         self, address: str | None = None, needs: Needs | None = None, tick: ProgressCallback = ignore, threads: int = 1
     ):
-        try:
-            import ray
-        except ImportError:
-            raise DmcvbError("--workers ray needs a package that is not installed: pip install 'ray>=2.40'") from None
+        import ray
+
         super().__init__(tick)
         self._ray, self._needs, self._threads = ray, needs or Needs(), threads
         self._ours = not ray.is_initialized()
