@@ -25,7 +25,7 @@ from dmcvb_gen.dataset.writer import file_facts, put, put_back, put_record, read
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.generate.inputs import background_source, local_inputs, policy_files
-from dmcvb_gen.generate.render import distractor_state_of, label_arrays, paint, paint_labels, renderers, videos_of
+from dmcvb_gen.generate.render import distractor_state_of, label_arrays, paint, paint_modality, renderers, videos_of
 from dmcvb_gen.generate.resolve import check_code, check_task_code, code_of_distractor
 from dmcvb_gen.generate.works import Setting, Work
 from dmcvb_gen.parallel import ProgressCallback, ignore
@@ -252,17 +252,13 @@ def _rendered(
     task, length, rows = get_task(record.task), episodes["length"], episodes["physics"].shape[1]
     renderer = renderers.get(record, backgrounds)
     physics = episodes["physics"][:, : labels.background_video.shape[1]]
-    modalities: dict[str, list[str]] = {}
-    for name, layer in layers.items():
-        if modality := layer.makes.get("modality"):
-            modalities.setdefault(modality, []).append(name)
     pictures = [name for name, layer in layers.items() if "modality" not in layer.makes]
     if pictures:
         yield from paint(task, renderer, physics, labels, length, rows, tick, pictures)
-    for modality, names in modalities.items():
-        views = [view for view in record.views if names == [modality] or f"{modality}/{view}" in names]
-        hidden = layers[names[0]].makes["hidden_goal"]
-        yield from paint_labels(renderer, physics, labels, length, rows, modality, hidden, views)
+    for name, layer in layers.items():
+        if modality := layer.makes.get("modality"):
+            view, hidden = name.partition("/")[2] or record.views[0], layer.makes["hidden_goal"]
+            yield name, paint_modality(renderer, physics, labels, length, rows, modality, hidden, view)
 
 
 # -- what becomes of a layer's arrays -------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dmcvb_gen.dataset.manifest import SubsetRecord
-from dmcvb_gen.dataset.pictures import picture_arrays, view_arrays
+from dmcvb_gen.dataset.pictures import picture_arrays
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.distractors import Backgrounds, floor_alpha_for, load_backgrounds, sample_distractors
 from dmcvb_gen.generate.modalities import Modality, Seen, get_modality
@@ -195,34 +195,33 @@ def look(
     ]
 
 
-def paint_labels(
+def paint_modality(
     renderer: Renderer,
     physics: np.ndarray,
     exogenous: DistractorState,
     length: np.ndarray,
     rows: int,
-    label: str,
+    name: str,
     hide_goal: bool,
-    views: Sequence[str],
-) -> Iterator[tuple[str, np.ndarray]]:
-    """A modality of what the subset's pictures show, one array a view.
+    view: str,
+) -> np.ndarray:
+    """A modality of what the subset's pictures of a view show.
 
     Args:
-      label: name of the modality. views: those of the task that the subset has.
+      name: of the modality.
 
-    Yields:
-      (name, (episode, rows, size, size, ...)); rows past an episode's end stay zero.
+    Returns:
+      (episode, rows, size, size, ...); rows past an episode's end stay zero.
     """
-    modality = get_modality(label)
+    modality = get_modality(name)
     last = length[:, None] - modality.needs_next  # whose next frame is there
     episode, row = np.nonzero(np.arange(physics.shape[1])[None] <= last)
-    for view, name in zip(views, view_arrays(label, views), strict=True):
-        size = (renderer.size, renderer.size, *modality.shape)
-        out = np.zeros((len(physics), rows, *size), modality.dtype)
-        for first in range(0, len(episode), LABEL_FRAMES):
-            at = (episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES])
-            out[at] = modality_of_frames(renderer, modality, physics, exogenous, at, view, hide_goal)
-        yield name, out
+    size = (renderer.size, renderer.size, *modality.shape)
+    out = np.zeros((len(physics), rows, *size), modality.dtype)
+    for first in range(0, len(episode), LABEL_FRAMES):
+        at = (episode[first : first + LABEL_FRAMES], row[first : first + LABEL_FRAMES])
+        out[at] = modality_of_frames(renderer, modality, physics, exogenous, at, view, hide_goal)
+    return out
 
 
 def modality_of_frames(
