@@ -7,12 +7,12 @@ damaged or missing, if they come out with their recorded digests. `remake` write
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dmcvb_gen.dataset.gate import Release, check_videos_shown, read_records
-from dmcvb_gen.dataset.manifest import LayerList, ListedLayer, Manifest, Resolved, canonical_json, list_path
+from dmcvb_gen.dataset.manifest import FileRecord, LayerList, ListedLayer, SubsetRecord, canonical_json, list_path
 from dmcvb_gen.dataset.writer import (
     begin,
     check_agree,
@@ -84,8 +84,7 @@ class Regeneration:
         """
         release = Release.open(open_store(self.place))
         works = self._works(release, lambda layer, shard: shard in release.here(layer.name), "check")
-        chosen = list(release.shards(release.select(self.only), self.episodes))
-        left = sum(not shard.here for shard in chosen)
+        left = sum(not shard.here for shard in release.shards(release.select(self.only), self.episodes))
         return Outcome(self.run(works, progress), environment_diff(release.store), left)
 
     def repair(self, progress: ProgressCallback = ignore) -> Outcome:
@@ -152,8 +151,7 @@ class Regeneration:
         broken = [f for f in release.inputs_of([record.name for record in records]) if wrong_bytes(release.store, f)]
         if not broken:
             return []
-        described = release.manifest.model_copy(update={"subsets": tuple(records), "inputs": tuple(broken)})
-        files = input_files(release.store, described, self.backgrounds)
+        files = input_files(release.store, records, broken, self.backgrounds)
         for file in broken:
             put_back(release.store, file, files[file.path])
         return [file.path for file in broken]
@@ -176,42 +174,42 @@ def remake(
     names = select([record.name for record in known.manifest.subsets], list(how.only))
     check_makeable(known.manifest, names)
     for recipe in known.recipes:
-        begin(store, recipe, input_files(source or store, recipe, how.backgrounds))
+        begin(store, recipe, input_files(source or store, recipe.subsets, recipe.inputs, how.backgrounds))
     write_provenance(store, "regenerate")
     target = Release.in_making(store)
     works = works_of(target, names, how.episodes, backgrounds=how.backgrounds)
     fresh = {(outcome.layer, outcome.shard) for outcome in how.run(works, progress)}
     finish(store)
-    made, outcomes = Release.in_making(store), {}
-    shards = {(shard.layer.name, shard.number): shard for shard in made.shards(names, how.episodes)}
-    for work in works_of(target, names, how.episodes, wanted=lambda layer, shard: True):
-        for layer in (layer for layer in work.layers if layer.name in known.records):
-            record, digests = made.records(layer.name).get(work.shard), known.records[layer.name]
-            if work.shard < len(digests):
-                place = layer.name, work.shard
-                equal = record is not None and sha256_bytes(canonical_json(record)) == digests[work.shard]
-                if equal and place not in fresh:  # it was there before, and its files may have changed since
-                    equal = not any(wrong_bytes(store, file) for file in shards[place].files)
-                outcomes[place] = ShardOutcome.of(layer, work.shard, equal=equal)
-    return Outcome(tuple(outcomes.values()), {})
+    outcomes = []
+    for shard in Release.in_making(store).shards(names, how.episodes):
+        name, number, digests = shard.layer.name, shard.number, known.records.get(shard.layer.name, ())
+        if number < len(digests):
+            equal = shard.record_file.sha256 == digests[number]
+            if equal and (name, number) not in fresh:  # it was there before, and its files may have changed since
+                equal = not any(wrong_bytes(store, file) for file in shard.files)
+            outcomes.append(ShardOutcome.of(shard.layer, number, equal=equal))
+    return Outcome(tuple(outcomes), {})
 
 
-def input_files(store: Store, described: Resolved | Manifest, backgrounds: str | None) -> dict[str, Path]:
-    """Path in the release -> file here, of all policies and videos that a recipe or manifest names.
+def input_files(
+    store: Store, subsets: Iterable[SubsetRecord], inputs: Collection[FileRecord], backgrounds: str | None
+) -> dict[str, Path]:
+    """Path in the release -> file here, of all policies and videos of subsets.
 
     Args:
+      inputs: those that must be there.
       backgrounds: folder of the videos, if not the release's own copies.
 
     Raises:
       StoreError: one is neither at the store nor in the package.
     """
-    root = local_inputs(store, described.inputs)
+    root = local_inputs(store, inputs)
     found: dict[str, Path] = {}
-    for record in described.subsets:
+    for record in subsets:
         paths = policy_files(root, record)
         found |= {policy.path: Path(path) for policy, path in zip(record.policies, paths, strict=True) if policy.path}
         found |= video_files(record.backgrounds, video_source(root, record, backgrounds))
-    for file in described.inputs:
+    for file in inputs:
         if file.path not in found:
             raise StoreError(f"{file.path} is neither in {store.place} nor given; give --backgrounds FOLDER")
     return found
