@@ -58,9 +58,8 @@ class DistractorState:
         return DistractorState(**{name: value.reshape(-1, *value.shape[lead:]) for name, value in self.items()})
 
 
-DISTRACTOR_STATE_NAMES = tuple(label.name for label in fields(DistractorState))
-"""Names of the labels, stored as "exogenous/<name>"."""
 LABEL_DTYPES: dict[str, str] = {label.name: label.metadata["dtype"] for label in fields(DistractorState)}
+"""Label, stored as "exogenous/<name>", -> its data type."""
 LABEL_DIMENSIONS: dict[str, tuple[str, ...]] = {
     label.name: label.metadata["dimensions"] for label in fields(DistractorState)
 }

@@ -12,7 +12,7 @@ import zarr
 from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ListedLayer, SubsetRecord, runs
 from dmcvb_gen.dataset.pictures import picture_of, shown
 from dmcvb_gen.dataset.schema import open_array
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, DistractorState
+from dmcvb_gen.distractor_state import LABEL_DTYPES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.spec import FIXED
 from dmcvb_gen.storage.errors import storage_errors
@@ -351,7 +351,7 @@ class Subset:
 
     def labels(self, episodes: slice | Iterable[int] | None = None) -> DistractorState:
         """The stored labels of the distractors, leading shape (episode, step); see `read`."""
-        names = [name for name in DISTRACTOR_STATE_NAMES if f"exogenous/{name}" in self.arrays]
+        names = [name for name in LABEL_DTYPES if f"exogenous/{name}" in self.arrays]
         if not names:
             raise StoreError(f"{self.name} was imported and has no labels; ask for subsets that were rolled out")
         return DistractorState(**{name: self.read(f"exogenous/{name}", episodes) for name in names})

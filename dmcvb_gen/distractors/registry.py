@@ -10,7 +10,7 @@ from importlib import metadata
 from typing import Any
 
 from dmcvb_gen import own_code
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES, OPTIONAL_LABELS
+from dmcvb_gen.distractor_state import LABEL_DTYPES, OPTIONAL_LABELS
 from dmcvb_gen.distractors.background import Background
 from dmcvb_gen.distractors.base import Distractor
 from dmcvb_gen.distractors.camera import Camera
@@ -76,7 +76,7 @@ def _checked(distractor: Any, kind: str) -> type[Distractor]:
         raise DmcvbError(
             f"{distractor!r} is no distractor {kind!r}; give a subclass of Distractor with kinds = ({kind!r},)"
         )
-    known = [name for name in DISTRACTOR_STATE_NAMES if name not in OPTIONAL_LABELS]
+    known = [name for name in LABEL_DTYPES if name not in OPTIONAL_LABELS]
     names, stream = (getattr(distractor, name, None) for name in ("names", "stream"))
     if names is None or not set(names) <= set(known) or stream not in DISTRACTOR_STREAMS:
         raise DmcvbError(f"{distractor!r}: give names out of {known}, and a stream out of {DISTRACTOR_STREAMS}")

@@ -19,7 +19,7 @@ from PIL import Image
 
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.dataset.pictures import shown
-from dmcvb_gen.distractor_state import DISTRACTOR_STATE_NAMES
+from dmcvb_gen.distractor_state import LABEL_DTYPES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes, write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
@@ -160,7 +160,7 @@ def _episode(subset: SubsetReader, index: int, command: str) -> dict[str, Any]:
     pictures, layer, names = shown(subset), subset.trajectories, entry_names(subset)
     span = layer.episodes_of(index // layer.episodes_per_shard)
     shows = subset.setting != "none"
-    labels = [name for name in DISTRACTOR_STATE_NAMES if shows and f"exogenous/{name}" in subset.arrays]
+    labels = [name for name in LABEL_DTYPES if shows and f"exogenous/{name}" in subset.arrays]
     numbers = ["state", "action", "reward", "seed", "terminated"]
     values = subset.episode(index, [*numbers, *(f"exogenous/{name}" for name in labels), *pictures.arrays])
     earned = np.concatenate([[0], np.cumsum(values["reward"], dtype=float)])
