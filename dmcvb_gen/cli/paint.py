@@ -59,16 +59,13 @@ def _painted_facts(done):
 
 def _painted(place, done):
     """Yield the result of painting in lines."""
-    rendered = f"Rendered {pluralize(done.shards, 'shards')}. {_compared(done)}."
+    compared = f"{done.known} of {done.shards} have the digests of the release"
+    if not done.known:
+        compared = "This release has no image digests to compare with"
+    elif done.differing:
+        compared = f"MISMATCH: {len(done.differing)} of {done.known} shards have other digests than the release"
+    rendered = f"Rendered {pluralize(done.shards, 'shards')}. {compared}."
     there = any(map(len, done.release.subsets.values()))
     nothing = "All local shards have images already." if there else "No episodes are here yet."
     yield f"{place}: {rendered if done.shards else nothing}"
     yield from (f"  differs: {name}" for name in done.differing[:10])
-
-
-def _compared(done) -> str:
-    if not done.known:
-        return "This release has no image digests to compare with"
-    if done.differing:
-        return f"MISMATCH: {len(done.differing)} of {done.known} shards have other digests than the release"
-    return f"{done.known} of {done.shards} have the digests of the release"

@@ -16,8 +16,6 @@ from dmcvb_gen.dataset.manifest import FileRecord, Layer, Manifest, Resolved, Sh
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.storage.store import Store
 
-Purpose = Literal["make", "check", "repair"]
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -51,7 +49,7 @@ class Work:
     known: Mapping[str, ShardRecord] = field(default_factory=dict)
     inputs: tuple[FileRecord, ...] = ()
     backgrounds: str | None = None
-    purpose: Purpose = "make"
+    purpose: Literal["make", "check", "repair"] = "make"
 
     @property
     def episodes(self) -> range:
