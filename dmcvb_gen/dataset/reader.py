@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 import zarr
 
+from dmcvb_gen.dataset.chunks import open_array
 from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ListedLayer, SubsetRecord, runs
 from dmcvb_gen.dataset.pictures import picture_of, shown
-from dmcvb_gen.dataset.schema import open_array
 from dmcvb_gen.distractor_state import LABEL_DTYPES, DistractorState
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.spec import FIXED

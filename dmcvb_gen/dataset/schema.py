@@ -1,4 +1,4 @@
-r"""Describe the layers and arrays of a subset, and how an array's shard becomes bytes.
+r"""Describe the layers and arrays of a subset.
 
 One Zarr v3 group a set of trajectories, arrays episode-major, one file an array and shard::
 
@@ -29,25 +29,13 @@ Rows past L are never written: a missing chunk costs no storage.
 
 from __future__ import annotations
 
-import asyncio
-import math
 from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-import zarr
-from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec, TransposeCodec, ZstdCodec
-from zarr.core.array import AsyncArray
-from zarr.core.array_spec import ArrayConfig
-from zarr.core.buffer import default_buffer_prototype
-from zarr.core.codec_pipeline import BatchedCodecPipeline
-from zarr.core.metadata.v3 import ArrayV3Metadata
-from zarr.dtype import parse_dtype
-from zarr.storage import MemoryStore, StorePath
 
-from dmcvb_gen.dataset.manifest import ArraySpec, Codec, Layer
+from dmcvb_gen.dataset.manifest import ArraySpec, Layer
 from dmcvb_gen.distractor_state import LABEL_DIMENSIONS, LABEL_DTYPES, OPTIONAL_LABELS
-from dmcvb_gen.errors import StoreError
 
 PIXEL_CHUNK_STEPS = 32
 """Steps of a chunk of images: the unit of reading."""
@@ -130,120 +118,40 @@ def image_array(
     )
 
 
-# -- arrays as Zarr has them ----------------------------------------------------------------------
+def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> dict[str, Any]:
+    """What an array's zarr.json says, from its spec alone; `chunks.open_array` builds our readers' arrays from it.
 
-
-_CONFIG = ArrayConfig(order="C", write_empty_chunks=True)
-"""Zarr leaves the choice of empty chunks to `BoundedZstd`: its own takes longer than the compression."""
-
-
-class BoundedZstd(ZstdCodec):
-    """zstd for arrays that are zero by default: it encodes a chunk of zeros as no chunk.
-
-    It decodes no more than a chunk, whatever a frame's header claims; rows that a frame lacks are zero.
-    """
-
-    async def _encode_single(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
-        return await super()._encode_single(chunk_bytes, chunk_spec) if chunk_bytes.as_numpy_array().any() else None
-
-    async def _decode_single(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
-        return await asyncio.to_thread(self._decode_sync, chunk_bytes, chunk_spec)  # which zarr before 3.1.6 does not
-
-    def _decode_sync(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
-        out = np.zeros(math.prod(chunk_spec.shape) * chunk_spec.dtype.item_size, np.uint8)
-        self._zstd_codec.decode(chunk_bytes.as_numpy_array(), out)
-        return chunk_spec.prototype.buffer.from_array_like(out)
-
-
-class _Sharding(ShardingCodec):
-    """Sharding that hands its codecs many chunks at once; one by one, most of the time goes into asyncio."""
-
-    @property
-    def codec_pipeline(self) -> Any:
-        return BatchedCodecPipeline.from_codecs(self.codecs, batch_size=64)
-
-
-def _filters(codec: Codec) -> tuple[Any, ...]:
-    """Array codecs before bytes: all are Zarr's own or numcodecs', so plain zarr-python reads them."""
-    if codec == "zstd":
-        return ()
-    from zarr.codecs import numcodecs
-
-    return (TransposeCodec(order=(0, 4, 1, 2, 3)), numcodecs.Delta(dtype="|u1"))
-
-
-def array_metadata(layer: Layer, spec: ArraySpec, episodes: int) -> ArrayV3Metadata:
-    """Zarr's metadata of an array, from its spec alone; our readers build arrays from it, others get zarr.json.
+    All codecs are Zarr's own or numcodecs', so plain zarr-python reads them.
 
     Args:
       episodes: length of the first axis.
     """
-    per_shard, rows = layer.episodes_per_shard, layer.rows
-    pixel_level = 1 if spec.codec == "channel-delta-zstd" else 3
-    array_to_bytes = [*_filters(spec.codec), BytesCodec(), BoundedZstd(level=pixel_level), Crc32cCodec()]
-    if not spec.steps:
-        shape, chunks, codecs = (episodes, *spec.shape), (per_shard, *spec.shape), array_to_bytes
-        dims: tuple[str, ...] = ("episode", *spec.dims)
-    else:
-        steps = min(spec.chunk_steps or rows, rows)
-        shape, dims = (episodes, rows, *spec.shape), ("episode", "step", *spec.dims)
-        chunks = (per_shard, -(-rows // steps) * steps, *spec.shape)
-        codecs = [_Sharding(chunk_shape=(1, steps, *spec.shape), codecs=array_to_bytes)]
-    return ArrayV3Metadata(
-        shape=shape,
-        data_type=parse_dtype(np.dtype(spec.dtype), zarr_format=3),
-        chunk_grid={"name": "regular", "configuration": {"chunk_shape": list(chunks)}},
-        chunk_key_encoding={"name": "default", "configuration": {"separator": "/"}},
-        fill_value=0,
-        codecs=codecs,
-        attributes={"array": spec.name, **spec.attributes},
-        dimension_names=dims,
-    )
+    dtype, filters, level = np.dtype(spec.dtype), [], 3
+    if spec.codec == "channel-delta-zstd":
+        filters = [_named("transpose", order=[0, 4, 1, 2, 3]), _named("numcodecs.delta", dtype="|u1")]
+        level = 1
+    to_bytes = _named("bytes", **({"endian": "little"} if dtype.itemsize > 1 else {}))
+    codecs = [*filters, to_bytes, _named("zstd", level=level, checksum=False), _named("crc32c")]
+    shape, chunk, dims = [episodes], [layer.episodes_per_shard], ["episode"]
+    if spec.steps:
+        steps = min(spec.chunk_steps or layer.rows, layer.rows)
+        shape, chunk, dims = [*shape, layer.rows], [*chunk, -(-layer.rows // steps) * steps], [*dims, "step"]
+        index = {"index_codecs": [_named("bytes", endian="little"), _named("crc32c")], "index_location": "end"}
+        codecs = [_named("sharding_indexed", chunk_shape=[1, steps, *spec.shape], codecs=codecs, **index)]
+    return {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": [*shape, *spec.shape],
+        "data_type": dtype.name,
+        "chunk_grid": _named("regular", chunk_shape=[*chunk, *spec.shape]),
+        "chunk_key_encoding": _named("default", separator="/"),
+        "fill_value": dtype.type(0).item(),
+        "codecs": codecs,
+        "attributes": {"array": spec.name, **spec.attributes},
+        "dimension_names": [*dims, *spec.dims],
+        "storage_transformers": [],
+    }
 
 
-def open_array(layer: Layer, spec: ArraySpec, episodes: int, store: Any) -> zarr.Array:
-    """An array over a Zarr store of its chunks, built from its spec; nothing is read."""
-    metadata = array_metadata(layer, spec, episodes)
-    return zarr.Array(AsyncArray(metadata=metadata, store_path=StorePath(store), config=_CONFIG))
-
-
-def encode(layer: Layer, spec: ArraySpec, values: np.ndarray) -> bytes | None:
-    """The bytes of an array's file of one shard.
-
-    Args:
-      values: (episode of the shard, row, ...) or (episode of the shard, ...); a full shard.
-
-    Returns:
-      None if all values are fill values: there is no file then.
-
-    Raises:
-      StoreError: the values have another shape or dtype than the spec.
-    """
-    rows = (layer.rows,) if spec.steps else ()
-    shape = (layer.episodes_per_shard, *rows, *spec.shape)
-    if values.shape != shape or values.dtype != np.dtype(spec.dtype):
-        raise StoreError(
-            f"{spec.name} of {layer.name} is {values.dtype} {values.shape}, and its layer stores {spec.dtype} {shape}"
-        )
-    chunks: dict[str, Any] = {}
-    array = open_array(layer, spec, layer.episodes_per_shard, MemoryStore(chunks))
-    array[...] = values
-    return next(iter(chunks.values())).to_bytes() if chunks else None
-
-
-def decode(layer: Layer, spec: ArraySpec, data: bytes | None) -> np.ndarray:
-    """The values of an array's file of one shard, see `encode`.
-
-    Raises:
-      StoreError: the bytes are damaged.
-    """
-    chunks: dict[str, Any] = {}
-    if data is not None:
-        key = layer.file_path(spec, 0).removeprefix(f"{layer.group}/{spec.stored_name}/")
-        chunks[key] = default_buffer_prototype().buffer.from_bytes(data)
-    array = open_array(layer, spec, layer.episodes_per_shard, MemoryStore(chunks))
-    try:
-        return np.asarray(array[...])
-    except Exception as error:  # codecs raise anything
-        reason = type(error).__name__
-        raise StoreError(f"{spec.name} of {layer.name} cannot be decoded ({reason}); fetch it again") from None
+def _named(name: str, **configuration: Any) -> dict[str, Any]:
+    return {"name": name} | ({"configuration": configuration} if configuration else {})

@@ -50,7 +50,7 @@ from dmcvb_gen.dataset.manifest import (
     record_path,
     runs,
 )
-from dmcvb_gen.dataset.schema import array_metadata, encode
+from dmcvb_gen.dataset.schema import array_metadata
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import parse_json, sha256_bytes, sha256_file
 from dmcvb_gen.storage.store import NotThere, Store
@@ -160,6 +160,8 @@ def put_shard(store: Store, layer: Layer, shard: int, arrays: Iterable[tuple[str
     Raises:
       StoreError: see `put`; arrays are missing; another job's record is there.
     """
+    from dmcvb_gen.dataset.chunks import encode  # Zarr, which whoever copies files does without
+
     specs, files, given = {spec.name: spec for spec in layer.arrays}, {}, set()
     for name, values in arrays:
         given.add(name)
@@ -327,7 +329,7 @@ def _add_layer(nodes: dict[str, dict[str, Any]], release: Release, subset: Subse
             nodes.setdefault(folder, _group({}))
         episodes = min(subset.episodes, (max(release.records(layer.name)) + 1) * layer.episodes_per_shard)
         episodes = max(episodes, nodes.get(path, {}).get("shape", (0,))[0])
-        nodes[path] = parse_json(canonical_json(array_metadata(layer, spec, episodes).to_dict()))
+        nodes[path] = parse_json(canonical_json(array_metadata(layer, spec, episodes)))
 
 
 def _group(attributes: dict[str, Any]) -> dict[str, Any]:

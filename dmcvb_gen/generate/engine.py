@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from dmcvb_gen.dataset.chunks import decode, encode
 from dmcvb_gen.dataset.manifest import ArraySpec, Layer, ShardFile, ShardRecord, SubsetRecord
-from dmcvb_gen.dataset.schema import decode, encode
 from dmcvb_gen.dataset.writer import file_facts, put, put_back, put_record, read_checked, wrong_bytes
 from dmcvb_gen.distractor_state import DistractorState
 from dmcvb_gen.errors import StoreError

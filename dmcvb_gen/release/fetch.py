@@ -15,7 +15,6 @@ from dmcvb_gen.dataset.manifest import COPY, MANIFEST, FileRecord, ListedLayer, 
 from dmcvb_gen.dataset.writer import finish_copy, wrong_bytes
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import free_bytes
-from dmcvb_gen.loaders.release import ReleaseReader, open_for_reading
 from dmcvb_gen.options import Count, Local, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, expect
 from dmcvb_gen.release.tree import attachments, check_apart, described_files, list_files, manifest_at
@@ -26,6 +25,7 @@ from dmcvb_gen.text import as_names, format_bytes, quoted
 
 if TYPE_CHECKING:
     from dmcvb_gen.generate.paint import RenderResult
+    from dmcvb_gen.loaders.release import ReleaseReader
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def fetch(
     storage_options: dict[str, Any] | None = None,
     workers: Count = 8,
     progress: bool = True,
-) -> ReleaseReader:
+) -> "ReleaseReader":
     """Download a published release, or a part of it, and open it.
 
     Args:
@@ -67,6 +67,8 @@ def fetch(
         else; there is no room; access is refused.
     """
     download(locals())
+    from dmcvb_gen.loaders.release import open_for_reading  # Zarr, which the command does without
+
     return open_for_reading(str(out))
 
 
