@@ -28,10 +28,7 @@ class Renderer(abc.ABC):
     """
 
     name: str
-    task: Task
-    size: int
     samples: int
-    floor_alpha: float
 
     def __init__(
         self, task: Task, size: int, *, backgrounds=None, floor_alpha: float = 1.0, samples: int | None = None

@@ -498,12 +498,12 @@ def shade_jobs(scene, scratch, pixels, veiled, known, further):
                 rest = (1.0 - rec[g, L.OPACITY]) * (1.0 - rec[g, L.OPACITY])  # what is transparent is drawn twice
                 veil = 1.0 - rest if layer == 2 else 1.0
                 shade_geom(scene, scratch, pixels, which, g, layer == 0, veil, further)
-        first, total = lists_at(room, geoms, 0, geoms), np.int64(get(jobs, length_at(room, geoms, 0, geoms)))
-        if further:
+        if further or layer != 1:
             continue
-        if layer == 1 and known:
+        first, total = lists_at(room, geoms, 0, geoms), np.int64(get(jobs, length_at(room, geoms, 0, geoms)))
+        if known:
             take_sky(jobs, color, room, pixels, first, total)
-        elif layer == 1:
+        else:
             shade_sky_jobs(s, k, scene.texels, scene.width, jobs, color, pixels, first, total)
 
 

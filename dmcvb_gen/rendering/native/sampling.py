@@ -63,19 +63,6 @@ def blend(one, two, three, four, across, down, shift):
     return (a * left + b * across) * top + (c * left + d * across) * down
 
 
-@leaf
-def add_texels(s, i, texels, base, columns, left, right, top, bottom, across, down, share):
-    """Add `share` of a blend of four texels of a level to TEXEL; the level begins at `base`, in rows of `columns`."""
-    top, bottom = i4(base + i4(top * columns)), i4(base + i4(bottom * columns))
-    one, two = get(texels, i4(top + left)), get(texels, i4(top + right))
-    three, four = get(texels, i4(bottom + left)), get(texels, i4(bottom + right))
-    red, green, blue = get3(s, L.TEXEL + i)
-    red += share * blend(one, two, three, four, across, down, i4(0))
-    green += share * blend(one, two, three, four, across, down, i4(8))
-    blue += share * blend(one, two, three, four, across, down, i4(16))
-    put3(s, L.TEXEL + i, red, green, blue)
-
-
 @part
 def add_level(s, n, texels, at, repeats, many, last, further, weight, slope):
     """Add one level's color at (S, T) to TEXEL, `weight + slope * MIX` times.
@@ -102,7 +89,14 @@ def add_level(s, n, texels, at, repeats, many, last, further, weight, slope):
         bottom = bottom if bottom < rows else (i4(0) if repeats else far_bottom)
         base = i4(base + i4(many * i4(get(s, L.FACE + i))) * i4(columns * rows))
         share = (weight + slope * get(s, L.MIX + i)) * f4(SHARE_UNIT)
-        add_texels(s, i, texels, base, columns, left, right, top, bottom, across, down, share)
+        top, bottom = i4(base + i4(top * columns)), i4(base + i4(bottom * columns))
+        one, two = get(texels, i4(top + left)), get(texels, i4(top + right))
+        three, four = get(texels, i4(bottom + left)), get(texels, i4(bottom + right))
+        red, green, blue = get3(s, L.TEXEL + i)
+        red += share * blend(one, two, three, four, across, down, i4(0))
+        green += share * blend(one, two, three, four, across, down, i4(8))
+        blue += share * blend(one, two, three, four, across, down, i4(16))
+        put3(s, L.TEXEL + i, red, green, blue)
 
 
 @leaf

@@ -13,9 +13,8 @@ from dmcvb_gen.rendering.native import layout as L
 from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.tasks.cameras import camera_ids
 
-PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
+_PAINTED = PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6
 """MuJoCo's numbers of the kinds of geoms painted here."""
-_PAINTED = (PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
 SUN_DISTANCE = 25.0
 """A directional light is a lamp so far away, times the model's extent."""
 OPAQUE = 0.995

@@ -290,10 +290,8 @@ def shade_body(s, n, k, rec, texels, width, plane, g, mirrored):
     else:
         for c in range(3):
             fill(s, n, L.TEXEL + c * L.CHUNK, f4(1))
-    if mirrored:
-        meet(s, n, rec, g, True)
-    elif rec[g, L.TEXTURE] < 0.0:
-        meet(s, n, rec, g, False)
+    if mirrored or rec[g, L.TEXTURE] < 0.0:  # else `cover_ball` has met it last
+        meet(s, n, rec, g, mirrored)
     light(s, n, k, rec, plane, g, mirrored)
 
 

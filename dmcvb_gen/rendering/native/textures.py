@@ -50,25 +50,21 @@ def halved(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     return rows[:, left] * (1 - across) + rows[:, right] * across
 
 
-def _linear_light(values: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 255] as linear light in [0, 1]."""
-    value = values / np.float32(255)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
 def _display(linear: np.ndarray) -> np.ndarray:
     """Linear light in [0, 1] as sRGB in [0, 255]."""
     return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-_LINEAR_OF = _linear_light(np.arange(256, dtype=np.float32)).astype(np.float32)
+_SRGB = np.arange(256, dtype=np.float32) / np.float32(255)
+_LINEAR_OF = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4).astype(np.float32)
+"""sRGB in whole numbers up to 255 -> linear light in [0, 1]."""
 
 
-def levels(picture: np.ndarray, srgb: bool = False, count: int | None = None) -> list[np.ndarray]:
+def levels(picture: np.ndarray, srgb: bool = False) -> list[np.ndarray]:
     """(h, w, 3) uint8 -> its mip levels, each uint8; sRGB ones as linear light in [0, 255]."""
     out: list[np.ndarray] = []
     current = picture
-    for width, height in level_sizes(picture.shape[1], picture.shape[0])[:count]:
+    for width, height in level_sizes(picture.shape[1], picture.shape[0]):
         if out:
             source = _LINEAR_OF[current] if srgb else current.astype(np.float32)
             smaller = halved(source, width, height)
@@ -103,10 +99,8 @@ def background_texels(picture: np.ndarray, room: dict[str, np.ndarray]) -> np.nd
         sizes = {"narrow": SKY_WIDTH * SKY_WIDTH, "tall": SKY_WIDTH * SKY_WIDTH, "all": total}
         room.update({name: np.empty(size, np.int32) for name, size in sizes.items()})
     across, down = taps(columns, SKY_WIDTH), taps(rows, SKY_WIDTH)
-    make_sky(np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], out := room["all"])
-    at, side = 0, SKY_WIDTH
-    while side % 2 == 0:
-        at, side = at + side * side, side // 2
+    out = room["all"]
+    at, side = make_sky(np.ascontiguousarray(picture), *across, *down, room["narrow"], room["tall"], out)
     smallest = out[at : at + side * side].view(np.uint8).reshape(side, side, 4)[..., :3]
     out[at:] = np.concatenate([packed(level) for level in levels(smallest)])
     return out
@@ -259,7 +253,10 @@ def halve(texels, side, out):
 
 @entry
 def make_sky(picture, across, across_weight, down, down_weight, narrow, tall, out):
-    """Make of (rows, columns, 3) uint8 the texels of `side` * `side` and of each half of it, up to an odd side."""
+    """Make of (rows, columns, 3) uint8 the texels of `side` * `side` and of each half of it, up to an odd side.
+
+    Gives where the texels of that side begin, and the side.
+    """
     rows, columns, side = picture.shape[0], picture.shape[1], down.size
     for row in range(rows):
         for x in range(columns):
@@ -271,3 +268,4 @@ def make_sky(picture, across, across_weight, down, down_weight, narrow, tall, ou
     while side % 2 == 0:
         halve(out[at : at + side * side], side // 2, out[at + side * side :])
         at, side = at + side * side, side // 2
+    return at, side
