@@ -180,22 +180,17 @@ def _find_videos(folder: Path) -> list[tuple[str, tuple[Path, ...]]]:
 
 
 def _decode(files: tuple[Path, ...]) -> np.ndarray:
-    parts, count = [], 0
-    for path in files:
+    parts = []
+    for path in files:  # one, or pictures of one frame each
         try:
-            if path.suffix.lower() in PICTURES | {".gif", ".webp"}:
-                parts.append(_read_pictures(path))
-            else:
-                parts.append(_read_video(path))
+            pictures = path.suffix.lower() in PICTURES | {".gif", ".webp"}
+            parts.append(_read_pictures(path) if pictures else _read_video(path))
         except ModuleNotFoundError:  # the command says what to install
             raise
         except Exception as error:  # decoders raise many kinds; all mean the same to the user
             what = f"cannot read background {path} ({first_line(error)})"
             raise BackgroundError(f"{what}; remove or replace the file") from None
-        count += len(parts[-1])
-        if count >= MAX_FRAMES:
-            break
-    frames = np.concatenate(parts)[:MAX_FRAMES] if len(parts) > 1 else parts[0]
+    frames = np.concatenate(parts) if len(parts) > 1 else parts[0]
     frames.flags.writeable = False  # the cache is shared
     return frames
 

@@ -68,16 +68,12 @@ def distractors_of(setting: DistractorSetting) -> tuple[type[Distractor], ...]:
 
 
 def _checked(distractor: Any, kind: str) -> type[Distractor]:
-    if (
-        not isinstance(distractor, type)
-        or not issubclass(distractor, Distractor)
-        or kind not in getattr(distractor, "kinds", ())
-    ):
+    kinds, names, stream = (getattr(distractor, name, None) for name in ("kinds", "names", "stream"))
+    if not isinstance(distractor, type) or not issubclass(distractor, Distractor) or kind not in (kinds or ()):
         raise DmcvbError(
             f"{distractor!r} is no distractor {kind!r}; give a subclass of Distractor with kinds = ({kind!r},)"
         )
     known = [name for name in LABEL_DTYPES if name not in OPTIONAL_LABELS]
-    names, stream = (getattr(distractor, name, None) for name in ("names", "stream"))
     if names is None or not set(names) <= set(known) or stream not in DISTRACTOR_STREAMS:
         raise DmcvbError(f"{distractor!r}: give names out of {known}, and a stream out of {DISTRACTOR_STREAMS}")
     return distractor
