@@ -106,8 +106,7 @@ class Policy:
         x = (np.asarray(observation, np.float32) - weights["observation_mean"]) / weights["observation_std"]
         x = np.ascontiguousarray(np.clip(x, -limit, limit))
         for index in range(len(header.hidden)):
-            x = self._dense(f"body.{2 * index}", x)
-            x = np.ascontiguousarray(_ACTIVATIONS[header.activation](x))
+            x = _ACTIVATIONS[header.activation](self._dense(f"body.{2 * index}", x))
         return x
 
     def distribution(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

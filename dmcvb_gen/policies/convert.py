@@ -230,9 +230,8 @@ def _holds_numbers(value: Any) -> bool:
     """Return True for a dense tensor of real numbers."""
     import torch
 
-    if not isinstance(value, torch.Tensor) or value.layout is not torch.strided or value.is_meta:
-        return False
-    return not value.is_complex()
+    dense = isinstance(value, torch.Tensor) and value.layout is torch.strided
+    return dense and not value.is_meta and not value.is_complex()
 
 
 # -- the parts of an actor ------------------------------------------------------------------------

@@ -118,18 +118,16 @@ def weight_shapes(header: PolicyHeader) -> dict[str, tuple[int, ...]]:
     "gaussian" a free vector `log_std_vector`); `observation_mean` and `observation_std` normalize what comes in.
     `way.<i>` are the layers of the network that knows the way, if there is one.
     """
+    layers: dict[str, tuple[int, int]] = {}  # inputs and outputs
+    body = (header.observation_size, *header.hidden)
+    way = (WAY_SIZE, *header.way, 2) if header.way is not None else ()
+    for name, widths in (("way", way), ("body", body)):
+        layers |= {f"{name}.{2 * index}": pair for index, pair in enumerate(itertools.pairwise(widths))}
+    for head in ("mean", "log_std") if header.distribution == "squashed_gaussian" else ("mean",):
+        layers[head] = body[-1], header.action_size
     shapes: dict[str, tuple[int, ...]] = {}
-    if header.way is not None:
-        widths = (WAY_SIZE, *header.way, 2)
-        for index, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
-            shapes |= {f"way.{2 * index}.weight": (fan_out, fan_in), f"way.{2 * index}.bias": (fan_out,)}
-    width = header.observation_size
-    for index, hidden in enumerate(header.hidden):
-        shapes |= {f"body.{2 * index}.weight": (hidden, width), f"body.{2 * index}.bias": (hidden,)}
-        width = hidden
-    heads = ("mean", "log_std") if header.distribution == "squashed_gaussian" else ("mean",)
-    for head in heads:
-        shapes |= {f"{head}.weight": (header.action_size, width), f"{head}.bias": (header.action_size,)}
+    for name, (inputs, outputs) in layers.items():
+        shapes |= {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
     if header.distribution == "gaussian":
         shapes["log_std_vector"] = (header.action_size,)
     observation = (header.observation_size,)

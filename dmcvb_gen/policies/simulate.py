@@ -60,24 +60,6 @@ class Simulation:
         return {name: value for name, value in vars(self).items() if name != "episodes"} | {"return": self.returns}
 
 
-def _empty(task: Task, episodes: np.ndarray, limit: int) -> Simulation:
-    """Episodes of `limit` steps that have not begun, all zeros."""
-    size, rows = len(episodes), limit + 1
-    return Simulation(
-        episodes=episodes,
-        state=np.zeros((size, rows, task.state_size), np.float32),
-        action=np.zeros((size, rows, task.action_size), np.float32),
-        reward=np.zeros((size, rows), np.float32),
-        discount=np.zeros((size, rows), np.float32),
-        physics=np.zeros((size, rows, task.physics_size)),
-        length=np.full(size, limit, np.int32),
-        terminated=np.zeros(size, bool),
-        seed=np.zeros(size, np.uint64),
-        behaviour=np.zeros(size, np.int16),
-        goal_pair=np.full(size, -1, np.int16),
-    )
-
-
 def simulate(
     task: Task,
     policies: Sequence[Policy],
@@ -108,9 +90,20 @@ def simulate(
     starts, noise = (
         [episode_stream(seed, names, int(i), name) for i in chosen] for name in ("initial_state", "policy")
     )
-    out = _empty(task, chosen, limit)
-    out.behaviour[:] = chosen % len(policies)
-    out.seed[:] = [episode_seed(seed, names, int(i)) for i in chosen]
+    size, rows = len(chosen), limit + 1
+    out = Simulation(
+        episodes=chosen,
+        state=np.zeros((size, rows, task.state_size), np.float32),
+        action=np.zeros((size, rows, task.action_size), np.float32),
+        reward=np.zeros((size, rows), np.float32),
+        discount=np.zeros((size, rows), np.float32),
+        physics=np.zeros((size, rows, task.physics_size)),
+        length=np.full(size, limit, np.int32),
+        terminated=np.zeros(size, bool),
+        seed=np.array([episode_seed(seed, names, int(i)) for i in chosen], np.uint64),
+        behaviour=(chosen % len(policies)).astype(np.int16),
+        goal_pair=np.full(size, -1, np.int16),
+    )
     if goal_pairs is not None:
         out.goal_pair[:] = chosen // (episodes_per_goal or 1)
     most = task.most_at_once or max(1, len(chosen))
