@@ -393,18 +393,13 @@ class PhysicsBatch(EpisodeBatch):
             ended = self._control_terminated() & moving
             terminated |= ended
             moving &= ~ended
-        if self.sims.warning[..., 1].any():
-            self._refuse_divergence(stepped)
+        counts = self.sims.warning[..., 1]
+        for sim in stepped[counts[stepped].any(axis=1)].tolist():  # its state means nothing
+            names = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(counts[sim])]
+            raise EpisodeError(self.task.id, sim, int(self._steps[sim]), diverged(names))
         self._steps[stepped] += 1
         nothing = np.zeros(self.size, bool)
         return StepResult(self.state(), reward, terminated, nothing, np.where(terminated, 0.0, 1.0))
-
-    def _refuse_divergence(self, ids: np.ndarray) -> None:
-        """Raise EpisodeError if MuJoCo warned of one of these simulations, whose state then means nothing."""
-        counts = self.sims.warning[..., 1]
-        for sim in ids[counts[ids].any(axis=1)].tolist():
-            names = [mujoco.mjtWarning(kind).name for kind in np.flatnonzero(counts[sim])]
-            raise EpisodeError(self.task.id, sim, int(self._steps[sim]), diverged(names))
 
     def _advance(self, ids: np.ndarray | None) -> None:
         self.sims.step(ids=ids, nstep=self.task.substeps, stage=int(mujoco.mjtStage.mjSTAGE_VEL))

@@ -61,18 +61,14 @@ class Kinematics:
 
     def _make(self, size: int) -> None:
         self._size = 1 << (size - 1).bit_length()
-        self._batch = Batch(_awake(self._task.model), self._size, nthread=1)
+        model = self._task.model
+        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+            model = copy.deepcopy(model)  # simulations that share memory cannot sleep, and poses do not depend on it
+            model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        self._batch = Batch(model, self._size, nthread=1)
         self._bound: dict[str, Any] = {}
         moving = (name for name in self._task.model_entries if name in MODEL_FIELDS)  # others move nothing
         self._entries = {name: self._batch.expand(name) for name in moving}
-
-
-def _awake(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A model whose bodies never sleep: simulations that share memory cannot, and poses do not depend on it."""
-    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        model = copy.deepcopy(model)
-        model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    return model
 
 
 def camera_ids(task: Task) -> list[int]:

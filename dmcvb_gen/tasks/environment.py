@@ -19,7 +19,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dmcvb_gen.errors import DmcvbError
+from dmcvb_gen.errors import DmcvbError, first_line
 from dmcvb_gen.tasks.base import EpisodeBatch, EpisodeError, StepResult, Task, diverged, field_owner
 from dmcvb_gen.tasks.randomness import held_states, seed_task, seeded, watched
 
@@ -49,8 +49,7 @@ def starting(task_id: str) -> Iterator[None]:
     except DmcvbError:
         raise
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DmcvbError(f"cannot start task {task_id} ({reason}); make it run by itself first") from error
+        raise DmcvbError(f"cannot start task {task_id} ({first_line(error)}); make it run by itself first") from error
 
 
 class EnvironmentTask(Task):
@@ -430,8 +429,7 @@ class _Episode:
         except PhysicsError as error:
             raise self.error(diverged([str(error).rpartition(": ")[2]])) from error
         except Exception as error:
-            reason = (str(error).splitlines() or [""])[0]
-            raise self.error(f"it failed ({type(error).__name__}: {reason})") from error
+            raise self.error(f"it failed ({type(error).__name__}: {first_line(error)})") from error
 
     def _observe(self, observation: Any) -> None:
         """Take an observation; a task of the suite is asked for it, see `suite`.

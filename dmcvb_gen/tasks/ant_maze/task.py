@@ -106,8 +106,7 @@ class AntMazeBatch(PhysicsBatch):
         ids, layout = self._all if ids is None else np.asarray(ids, int), self.task.layout
         self._clear(ids)
         for sim, rng, (start, goal) in zip(ids, generators, pairs, strict=True):
-            layout.check_cell(start, "start")
-            layout.check_cell(goal, "goal")
+            layout.check_cell(start, "start")  # the goal's field is asked for by `_refresh`, which checks its cell
             self._place(sim, rng, start, goal)
         self._refresh(ids)
         return self.state()
@@ -246,11 +245,8 @@ class AntMazeBatch(PhysicsBatch):
 
 def _sensor_columns(model: mujoco.MjModel, suffix: str) -> np.ndarray:
     """Columns of sensordata of the sensors whose names end so, in the model's order."""
-    columns: list[int] = []
-    for index in range(model.nsensor):
-        if model.sensor(index).name.endswith(suffix):
-            columns.extend(range(model.sensor_adr[index], model.sensor_adr[index] + model.sensor_dim[index]))
-    return np.array(columns, int)
+    chosen = [model.sensor(index).name.endswith(suffix) for index in range(model.nsensor)]
+    return np.flatnonzero(np.repeat(chosen, model.sensor_dim))  # sensors lie one after another
 
 
 class AntMaze(Task):
