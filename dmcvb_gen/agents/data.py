@@ -103,7 +103,7 @@ class FrameTable:
         self.table = torch.from_numpy(frames).to("cpu" if self.mapped else device)
         self._file = frames.base if isinstance(frames.base, mmap.mmap) else None
         if self._file is not None:
-            _advise(self._file, "RANDOM", 0, frames.nbytes)  # what stands beside a stack is not read with it
+            _advise(self._file, mmap.MADV_RANDOM, 0, frames.nbytes)  # what stands beside a stack is not read with it
         _, self.channels, self.size, _ = frames.shape
         # Which pixel stands where, after padding.
         self._mirror = torch.from_numpy(np.pad(np.arange(self.size), PAD, mode="symmetric")).to(self.table.device)
@@ -114,7 +114,7 @@ class FrameTable:
         if self._file is not None:
             frame = self.table[0].numel()
             for first, last in rows[:, [0, -1]].tolist():
-                _advise(self._file, "WILLNEED", first * frame, (last + 1) * frame)
+                _advise(self._file, mmap.MADV_WILLNEED, first * frame, (last + 1) * frame)
         (batch, frames), wide = rows.shape, self.size + 2 * PAD
         # The last line is picked twice. Otherwise planes of 64 x 64 would lie a page apart, and all channels of a pixel
         # would compete for the same few lines of the processor's cache when they are brought together.
@@ -128,12 +128,10 @@ class FrameTable:
         return lines.view(batch, frames * self.channels, self.size + 1, self.size)[:, :, :-1]
 
 
-def _advise(file: mmap.mmap, use: str, start: int, stop: int) -> None:
-    """Tell the system how bytes start..stop of a mapped file will be used, if it can be told."""
-    advice = getattr(mmap, f"MADV_{use}", None)
-    if advice is not None:
-        start -= start % mmap.PAGESIZE
-        file.madvise(advice, start, stop - start)
+def _advise(file: mmap.mmap, use: int, start: int, stop: int) -> None:
+    """Tell the system how bytes start..stop of a mapped file will be used."""
+    start -= start % mmap.PAGESIZE
+    file.madvise(use, start, stop - start)
 
 
 def normalize_pixels(pictures: torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -169,7 +167,6 @@ class TrainingData:
     Args:
       table: their rows, with frames that have a border of `PAD`, or none.
       held_out: (episode,) bool, which episodes no agent learns from.
-      stack: frames an observation.
       returns: (episode,) float64, of all episodes in it.
       device: device that holds everything.
 
@@ -180,19 +177,14 @@ class TrainingData:
       normalization: normalization of the states, from the training episodes.
       train_rows, hold_out_rows: (n,) long, rows that hold a transition.
       latent: (row, latent) float32 of a frozen encoder (`encoded`); None elsewhere.
+      stack: frames an observation; `but` gives another one.
     """
 
     latent: torch.Tensor | None = None
+    stack: int = FRAMES
     labeled_rows: torch.Tensor
 
-    def __init__(
-        self,
-        table: StepTable,
-        held_out: np.ndarray,
-        stack: int = FRAMES,
-        returns: np.ndarray | None = None,
-        device: str | torch.device = "cpu",
-    ):
+    def __init__(self, table: StepTable, held_out: np.ndarray, returns: np.ndarray | None = None, device: str = "cpu"):
         values = (getattr(table, name) for name in (*FIELDS, "start", "end", "steps"))
         state, *values, self.start, self.end, rows = (torch.from_numpy(value).to(device) for value in values)
         self.action, self.reward, self.discount = (value.float() for value in values)
@@ -201,7 +193,7 @@ class TrainingData:
         self.normalization = Normalization.of(state[~held])
         self.state = self.normalization(state.float())
         self.frames = None if table.frames is None else FrameTable(table.frames, device)
-        self.lengths, self.held_out, self.returns, self.stack = table.lengths, held_out, returns, stack
+        self.lengths, self.held_out, self.returns = table.lengths, held_out, returns
 
     @property
     def sizes(self) -> Sizes:
@@ -241,7 +233,6 @@ class TrainingData:
         next_observation: bool = False,
         k: int = 1,
         sample_k: bool = False,
-        later: bool = False,
         hold_out: bool = False,
         shift: bool = True,
         **options: Any,
@@ -251,10 +242,9 @@ class TrainingData:
         Args:
           next_observation: give the observation k steps later too, under the same shift.
           k: steps between the two; with `sample_k` drawn from 1..k for each.
-          later: the next observation is one step later, and the one k steps later is given besides.
           hold_out: draw from the held-out episodes, without shifts.
           shift: move each stack of pictures by up to 4 pixels either way (section 5, "Preprocessing details").
-          options: dtype and pictures of `transitions`.
+          options: dtype, pictures and later of `transitions`.
 
         Raises:
           DmcvbError: there are no transitions to draw from.
@@ -272,7 +262,7 @@ class TrainingData:
             offsets = self._to_device(generator.integers(2 * PAD + 1, size=(2, size)))
         if next_observation:
             steps = self._to_device(generator.integers(1, k + 1, size=size) if sample_k else np.full(size, k))
-        return self.transitions(rows[self._to_device(index)], steps, offsets, later=later, **options)
+        return self.transitions(rows[self._to_device(index)], steps, offsets, **options)
 
     def transitions(
         self,
@@ -290,7 +280,7 @@ class TrainingData:
           steps: (batch,) long, how far off the next observation is; None: no next observation.
           shift, dtype: see `observe`. Half the bytes are half the time to write them.
           pictures: give observations even if the data are encoded.
-          later: see `batch`.
+          later: the next observation is one step later, and the one that is `steps` later is given besides.
         """
         now = following = last = None
         if pictures or self.latent is None:
@@ -438,4 +428,4 @@ def load_data(
     if "low" in bounds:
         table.action[:] = to_unit(table.action, *(np.array(bounds[name], np.float32) for name in ("low", "high")))
     returns = np.concatenate([part.subset.read("return", part.episodes) for part in parts])
-    return TrainingData(table, np.concatenate(held_out), FRAMES, returns, device)
+    return TrainingData(table, np.concatenate(held_out), returns, device)

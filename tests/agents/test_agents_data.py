@@ -35,7 +35,7 @@ def make_data(stack=3, held=(False, True, False), size=SIZE):
     pictures = torch.randint(0, 256, (rows, 3, size, size), generator=generator, dtype=torch.uint8).numpy()
     frames = np.pad(pictures, ((0, 0), (0, 0), (0, 0), (PAD, PAD)), mode="symmetric")
     fields = {"state": state, "action": np.stack([count, count], 1) / rows, "reward": count, "discount": count * 0 + 1}
-    return TrainingData(StepTable(fields, LENGTHS, frames), np.array(held), stack)
+    return TrainingData(StepTable(fields, LENGTHS, frames), np.array(held)).but(stack=stack)
 
 
 def pictures_of(data):
