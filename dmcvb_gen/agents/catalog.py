@@ -64,13 +64,10 @@ class Agent:
         return ":".join([self.base, *options])
 
     @property
-    def paper_name(self) -> str | None:
-        """The column of the paper's table; None if it has none."""
-        if ":" in self.name or (self.sees_state and self.policy != "bc"):
-            return None
-        if self.sees_state:
-            return "bc(state)"
-        return f"{self.pretrain or 'null'}+{self.policy}"
+    def paper_name(self) -> str:
+        """The name as agents are named in the paper's table, which has few of them."""
+        base = f"{self.policy}(state)" if self.sees_state else f"{self.pretrain or 'null'}+{self.policy}"
+        return base + self.name.removeprefix(self.base)
 
     @property
     def sees_by_dino(self) -> bool:

@@ -273,7 +273,7 @@ def goal_cells(subset: Subset, pair: int | None) -> tuple[tuple[int, int], tuple
 # -- the paper's scores -----------------------------------------------------------------------------
 
 
-def paper_score(task: str, level: str, setting: str, agent: str | None) -> tuple[float, float] | None:
+def paper_score(task: str, level: str, setting: str, agent: str) -> tuple[float, float] | None:
     """(mean, standard error) of the published score of B1; None if the paper has none.
 
     Args:
@@ -282,7 +282,7 @@ def paper_score(task: str, level: str, setting: str, agent: str | None) -> tuple
       agent: a column of the paper's table, `Agent.paper_name`, or "data".
     """
     table = read_table("dmcvb_gen.benchmarks", "paper_benchmark1_locomotion.csv", 4)
-    row = table.get((task, level, setting, agent or "")) or table.get((task, level, "any", agent or ""))
+    row = table.get((task, level, setting, agent)) or table.get((task, level, "any", agent))
     return row and (row["mean"], row["stderr"])
 
 

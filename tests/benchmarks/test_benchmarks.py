@@ -171,7 +171,8 @@ def test_the_papers_scores_are_those_of_its_table():
     assert paper_score("walker-walk", "expert", "dynamic", "null+bc") == (913, 10)
     assert paper_score("humanoid-walk", "expert+medium", "static", "bc(state)") == (585, 21)
     assert paper_score("walker-walk", "expert", "dynamic_hard", "null+bc") is None
-    assert paper_score("walker-walk", "expert", "none", None) is None
+    for name in ("state-td3-bc", "bc:frames=1", "lapo+bc"):
+        assert paper_score("walker-walk", "expert", "none", parse_agent(name).paper_name) is None
 
 
 def test_a_scaled_profile_says_so():
