@@ -79,11 +79,9 @@ class DinoEncoder(nn.Module):
             raise DmcvbError(f"{weights} is no .safetensors file; give --dino-weights one")
         try:
             vit = _timm().create_model("vit_small_patch16_224", checkpoint_path=str(weights), **_sizes(weights))
-        except (OSError, SafetensorError) as error:
-            raise DmcvbError(f"cannot read DINO weights {weights} ({error}); give a safetensors file") from None
-        except (KeyError, ValueError, RuntimeError) as error:
-            what = f"{weights} does not hold the weights of a DINO vision transformer"
-            raise DmcvbError(f"{what} ({first_line(error)})") from None
+        except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
+            what = f"{weights} does not hold the weights of a DINO vision transformer ({first_line(error)})"
+            raise DmcvbError(f"{what}; give --dino-weights another safetensors file") from None
         vit.reset_classifier(0)
         return cls(vit.float().eval().requires_grad_(False), channels)
 
