@@ -151,11 +151,8 @@ def agent_names(agents: Names | None, dino_weights: Location | None) -> list[str
     from dmcvb_gen.agents.dino import DinoEncoder
 
     names = [name.strip() for text in as_names(agents) for name in text.split(",") if name.strip()]
-    needed = any(agent.sees_by_dino for agent in map(parse_agent, names))
-    if dino_weights is not None and not needed:
-        raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
-    if dino_weights is None and needed:
-        raise DmcvbError(DinoEncoder.missing)
-    if dino_weights is not None:
+    if any(agent.sees_by_dino for agent in [parse_agent(name) for name in names]):  # all are known
         DinoEncoder.digest(dino_weights)  # read, before any work
+    elif dino_weights is not None:
+        raise DmcvbError("--dino-weights has no effect: no agent is asked for that needs them; add --agents dino+bc")
     return names
