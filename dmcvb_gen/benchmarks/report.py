@@ -36,7 +36,7 @@ from dmcvb_gen.files import write_json, write_text
 from dmcvb_gen.generate.info import STATISTICS, return_statistics
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.release.issue import Issue
-from dmcvb_gen.spec import is_maze, task_folder
+from dmcvb_gen.spec import task_folder
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.storage.places import local_path
 from dmcvb_gen.tasks import get_task
@@ -143,12 +143,9 @@ def claim_folder(out: str | Path, release: Release, budget: Budget, training: bo
     folder = local_path(out)
     if release.store.folder and folder.resolve().is_relative_to(release.store.folder.resolve()):
         raise DmcvbError(f"{folder} lies in the release, which never changes; choose another --out")
-    try:
+    with storage_errors(folder, "write to"):
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise DmcvbError(f"cannot write to {folder} ({error.strerror or error}); choose another --out") from None
+        tempfile.TemporaryFile(dir=folder).close()
     mine, path = {"release": release.manifest.name, "budget": budget.facts()}, folder / "budget.json"
     there = mine
     with contextlib.suppress(OSError, ValueError):
@@ -448,8 +445,7 @@ def _groups(facts: Mapping[str, Any]) -> list[tuple[str, ...]]:
     groups: dict[tuple, list[Mapping[str, Any]]] = {}
     for result in facts["results"] if facts["budget"]["scores"] else ():
         cell = Cell.of(result["cell"])
-        group = BENCHMARKS.get(cell.benchmark).group(cell) if is_maze(cell.task) else None
-        if group is not None:
+        if group := BENCHMARKS.get(cell.benchmark).group(cell):
             groups.setdefault((cell.benchmark, *group, cell.setting, cell.label), []).append(result["score"])
     rows = []
     for key, scores in groups.items():

@@ -274,7 +274,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_any_work(release, tmp
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("dmcvb_gen.benchmarks.checks.check_structure", lambda *_: pytest.fail("work was done"))
     result = invoke("validate", release, "--out", tmp_path / "file" / "report", code=2)
-    assert "choose another --out" in result.output
+    assert "is a file; choose another place" in result.output
 
 
 @pytest.mark.parametrize("name, words", [("budget.json", ["--agents=state-bc"]), ("report.json", ["--checks-only"])])
