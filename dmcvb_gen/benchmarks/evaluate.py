@@ -32,10 +32,10 @@ from dmcvb_gen.generate.recipe import NATIVE
 from dmcvb_gen.generate.references import normalized, reference_returns
 from dmcvb_gen.generate.render import open_renderer
 from dmcvb_gen.generate.request import background_source
-from dmcvb_gen.options import Count, Location, Seed, Split, checked
+from dmcvb_gen.options import Count, Location, Seed, Split, checked, refuse
 from dmcvb_gen.policies.evaluation import goal_scores
 from dmcvb_gen.seeding import DISTRACTOR_STREAMS, episode_stream
-from dmcvb_gen.spec import LEVELS, GoalMode, SubsetSpec, parse_setting, task_folder
+from dmcvb_gen.spec import FIXED, SubsetSpec, parse_setting, task_folder
 from dmcvb_gen.tasks import ACTION_REPEAT, Task, get_task
 
 if TYPE_CHECKING:
@@ -105,9 +105,8 @@ def evaluation_steps(task: Task, max_steps: int | None = None) -> int:
 
 def renderer_choice(subset: Subset) -> dict[str, Any]:
     """Name and samples of the renderer: the data's own, or the default one if the record names none of ours."""
-    if subset.record.imported or not subset.record.renderer:
-        return {"name": NATIVE, "samples": None}
-    return {"name": subset.record.renderer["name"], "samples": subset.record.renderer.get("samples")}
+    own = {} if subset.record.imported else subset.record.renderer
+    return {"name": own.get("name", NATIVE), "samples": own.get("samples")}
 
 
 @dataclass(frozen=True)
@@ -152,12 +151,7 @@ class EvaluationScene:
         task, slash, setting = where.rpartition("/")
         if not slash or not setting:
             raise DmcvbError(f"{where!r} names no evaluation; give TASK/SETTING, e.g. walker-walk/dynamic")
-        head, _, level = task.rpartition("/")
-        if level in LEVELS:
-            raise DmcvbError(f"{where!r} names a subset; an evaluation has no level: give {head}/{setting}")
         spec = SubsetSpec.parse(task, "random", setting)
-        if spec.goal is GoalMode.FIXED:
-            raise DmcvbError(f"{where}: goals are fixed by a release's episodes; use `validate --benchmark b3`")
         views = [view for view in get_task(task).views if view not in NOT_TRAINED_ON]
         return cls(task, spec.setting, Pictures(tuple(views), spec.hides_goal), **options)
 
@@ -350,14 +344,11 @@ def evaluate(
     pixels = _own_value(policy, "pixels", pixels, True)
     backgrounds = None if backgrounds is None else background_source(backgrounds)
     shown: dict[str, Any] = dict(stack=stack, size=size, renderer=renderer, samples=samples, backgrounds=backgrounds)
-    for name, value in shown.items():
-        if value is not None and not pixels:
-            raise DmcvbError(f"{name} has no effect without pictures; leave it out")
+    if not pixels:
+        refuse("the policy sees no pictures", **shown)
     stack = _own_value(policy, "stack", stack, 3)
     seen = getattr(policy, "evaluation", None) or {}
     if isinstance(where, Subset):
-        if where.record.goal_mode is GoalMode.FIXED:
-            raise DmcvbError(f"{where.name} has fixed goals; score policies on them by `validate --benchmark b3`")
         scene = EvaluationScene.of(where, backgrounds)
         _own_value(policy, "picture_size", scene.size if pixels and size is None else size, 0)
         longest = where.record.max_steps * where.record.action_repeat // (action_repeat or where.record.action_repeat)
@@ -368,6 +359,8 @@ def evaluate(
         repeat = seen.get("action_repeat", ACTION_REPEAT)
         shown = dict(renderer=drawn["name"], samples=drawn["samples"], action_repeat=repeat)
         scene = EvaluationScene.parse(where, backgrounds=backgrounds or BUILTIN, size=size, **shown)
+    if scene.setting == FIXED:
+        raise DmcvbError(f"{scene.task} has fixed goals here; score policies on them by `validate --benchmark b3`")
     if backgrounds is not None and not parse_setting(scene.task, scene.setting)[0].shows_videos:
         raise DmcvbError(f"{scene.task}/{scene.setting} shows no videos, so backgrounds have no effect: leave them out")
     if renderer not in (None, scene.renderer):
@@ -504,7 +497,7 @@ def load_agent(path: str | Path) -> TrainedAgent:
     import torch
     from safetensors import SafetensorError, safe_open
 
-    from dmcvb_gen.agents.catalog import parse_agent
+    from dmcvb_gen.agents.catalog import make_encoder, make_policy, parse_agent
     from dmcvb_gen.agents.data import Normalization, Sizes
     from dmcvb_gen.agents.networks import Architecture
 
@@ -520,7 +513,8 @@ def load_agent(path: str | Path) -> TrainedAgent:
             raise ValueError("the normalization does not fit")
         for device in ("meta", "cpu"):  # without memory first: a file may name any size
             with torch.device(device):
-                policy = _untrained(agent, sizes, network)
+                encoder = make_encoder(agent, sizes, architecture=network)
+                policy = make_policy(agent, encoder, sizes, network)
             missing, unexpected = policy.load_state_dict(tensors, strict=False, assign=device == "meta")
             if unexpected or any(map(policy.acts_by, missing)):
                 raise ValueError("its weights do not fit")
@@ -528,9 +522,3 @@ def load_agent(path: str | Path) -> TrainedAgent:
         return TrainedAgent(agent, sizes, policy.eval(), normalization, dict(facts.get("evaluation", {})))
     except (OSError, SafetensorError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
         raise DmcvbError(f"{path} is no agent that validate trained ({first_line(error)})") from None
-
-
-def _untrained(agent: Agent, sizes: Sizes, network: Architecture) -> Policy:
-    from dmcvb_gen.agents.catalog import make_encoder, make_policy
-
-    return make_policy(agent, make_encoder(agent, sizes, architecture=network), sizes, network)

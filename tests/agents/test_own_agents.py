@@ -107,7 +107,7 @@ def test_options_that_mean_nothing_are_refused(option):
 
 @pytest.mark.parametrize("option", [dict(stack=2), dict(size=32), dict(renderer="native"), dict(backgrounds="clips")])
 def test_image_options_are_refused_without_images(option):
-    with pytest.raises(DmcvbError, match=f"{next(iter(option))} has no effect without pictures; leave it out"):
+    with pytest.raises(DmcvbError, match=f"{next(iter(option))} has no effect: the policy sees no pictures; remove it"):
         dmcvb_gen.evaluate(lambda observation: None, "walker-walk/dynamic", pixels=False, **option)
     with pytest.raises(DmcvbError, match="walker-walk/dynamic_camera0.2 shows no videos, so backgrounds"):
         dmcvb_gen.evaluate(lambda observation: None, "walker-walk/dynamic_camera0.2", backgrounds="builtin")

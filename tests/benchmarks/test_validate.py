@@ -16,11 +16,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 import dmcvb_gen
+from dmcvb_gen.agents import catalog
 from dmcvb_gen.agents.catalog import parse_agent
 from dmcvb_gen.agents.data import Slice, load_data
 from dmcvb_gen.agents.networks import PATCHES
 from dmcvb_gen.benchmarks import checks
-from dmcvb_gen.benchmarks import evaluate as evaluation
 from dmcvb_gen.benchmarks.cell import data_score
 from dmcvb_gen.benchmarks.evaluate import load_agent
 from dmcvb_gen.benchmarks.plan import BUDGETS, Cell, goal_cells, only, plan_benchmark
@@ -375,14 +375,14 @@ def test_a_file_that_names_other_sizes_than_it_holds_makes_no_networks(change, w
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     changed = [] if change == "no facts" else facts | {key: facts[key] | new for key, new in change.items()}
     save_file(tensors, str(tmp_path / "x.safetensors"), metadata={"facts": json.dumps(changed)})
-    made, untrained = [], evaluation._untrained
+    made, make_policy = [], catalog.make_policy
 
     def watched(*arguments):
-        policy = untrained(*arguments)
+        policy = make_policy(*arguments)
         made.append(next(policy.parameters()).device.type)
         return policy
 
-    monkeypatch.setattr(evaluation, "_untrained", watched)
+    monkeypatch.setattr(catalog, "make_policy", watched)
     with pytest.raises(DmcvbError, match="no agent that validate trained"):
         load_agent(tmp_path / "x.safetensors")
     assert "cpu" not in made

@@ -71,7 +71,7 @@ def test_what_cannot_be_made_or_scored_is_refused_in_a_line(levels, small_mazes)
         (lambda: dmcvb_gen.make(random, release=folder, size=32), "size has no effect: with a release"),
         (lambda: dmcvb_gen.make(random, release=folder, episodes=1), "episodes is 1: input should be greater"),
         (lambda: dmcvb_gen.make(random, release=folder, held_out=1.5), "held_out is 1.5"),
-        (lambda: fixed.evaluate(print), "has fixed goals; score policies on them by `validate --benchmark b3`"),
+        (lambda: fixed.evaluate(print), "has fixed goals here; score policies on them by `validate --benchmark b3`"),
     ):
         with pytest.raises(DmcvbError, match=words):
             call()
