@@ -333,12 +333,12 @@ class CellRun:
             "final": evaluations[-1]["score"],
             "evaluations": len(evaluations),
             "paper": paper and {"mean": paper[0], "stderr": paper[1]},
-            "data": {key: value for key, value in data_score(subset, data).facts().items() if key != "returns"},
+            "data": _brief(data_score(subset, data).facts()),
             "episodes": len(data.lengths),
             "transitions": len(data),
             "evaluation": evaluation_of(self.release, budget, cell),
             "renderers": {"data": subset.record.renderer["name"], "evaluation": renderer_choice(subset)["name"]},
-            "curve": [_thin(point) for point in curve],
+            "curve": [point | {"score": _brief(point["score"])} if "score" in point else point for point in curve],
             "machine": {"device": budget.device, "threads": budget.threads, "torch": torch.__version__},
             "generator": f"dmcvb-gen {__version__}",
         }
@@ -392,11 +392,9 @@ def data_score(subset: Subset, data: TrainingData) -> Score:
     return Score.of(data.returns, success=success, speed=speed, limit=subset.record.max_steps)
 
 
-def _thin(point: dict[str, Any]) -> dict[str, Any]:
-    """A point of the curve without the returns of every episode."""
-    if "score" not in point:
-        return point
-    return point | {"score": {key: value for key, value in point["score"].items() if key != "returns"}}
+def _brief(score: dict[str, Any]) -> dict[str, Any]:
+    """The facts of a score without the returns of every episode."""
+    return {key: value for key, value in score.items() if key != "returns"}
 
 
 def _to_pictures(values: torch.Tensor) -> np.ndarray:

@@ -146,14 +146,6 @@ def known_returns(release: Release) -> dict[str, np.ndarray]:
     return {name: returns for name, returns in found.items() if len(returns)}
 
 
-def _painter_drift(release: Release, backgrounds: str | None) -> Iterator[Issue]:
-    """Warn of versions that differ from those for which the pictures rendered on reading are promised."""
-    painted = [subset.record for subset in release.subsets.values() if isinstance(subset, PaintedSubset)]
-    here = [rendered_here(record, background_source(release.path, record, backgrounds)) for record in painted]
-    for text in render_differences(release, here):
-        yield Issue("painter", "images painted on reading", text)
-
-
 def check_structure(
     release: Release, backgrounds: str | None = None, tick: ProgressCallback = ignore, workers: Workers = 1
 ) -> Structure:
@@ -179,7 +171,10 @@ def check_structure(
         for found, odd in in_order(_check_subset, readable, pool):
             findings += found
             warnings += odd
-    warnings += _painter_drift(release, backgrounds)
+    # Versions may differ from those for which the pictures rendered on reading are promised.
+    painted = [subset.record for subset in subsets if isinstance(subset, PaintedSubset)]
+    here = [rendered_here(record, background_source(release.path, record, backgrounds)) for record in painted]
+    warnings += [Issue("painter", "images painted on reading", text) for text in render_differences(release, here)]
     return Structure(verified.checked, tuple(findings), tuple(warnings))
 
 

@@ -65,8 +65,7 @@ BUDGETS = {
             rate=2.0,
             note="brief: a small network of 4x4 patches and frame differences, 0.3 % of the paper's samples (2.5 % of "
             "states), random shifts only from ten passes over the data on, none on a frozen encoder, twice the rate, "
-            "falling; scores are not "
-            "comparable with the paper's",
+            "falling; scores are not comparable with the paper's",
             **SHORT,
         ),
         Budget(
@@ -88,11 +87,6 @@ BUDGETS = {
 
 ENCODER = "encoder"
 """The benchmark of cells that train an encoder alone."""
-
-
-def slug(text: str) -> str:
-    """A piece of a file name."""
-    return re.sub(r"[^A-Za-z0-9.+-]+", "-", text.replace("%", "pc")).strip("-")
 
 
 @dataclass(frozen=True)
@@ -117,7 +111,7 @@ class Cell:
         """A file name, different for every cell of a release, whose subsets' names leave out a maze's rows, too."""
         parts = [self.benchmark, spec.task_folder(self.task), self.setting, self.agent.name, self.policy_label]
         parts += [f"from {self.pretrain_label}"] if self.pretrain else []
-        return "_".join(slug(part) for part in parts)
+        return "_".join(re.sub(r"[^A-Za-z0-9.+-]+", "-", part.replace("%", "pc")).strip("-") for part in parts)
 
     @property
     def policy_label(self) -> str:
@@ -168,8 +162,7 @@ class Cell:
           DmcvbError, LookupError, TypeError: they name an agent that is not known here, or are no cell's.
         """
         parts = {name: tuple(Slice(**part) for part in facts[name]) for name in ("policy", "pretrain")}
-        places = {name: facts[name] for name in ("benchmark", "task", "setting")}
-        return cls(agent=parse_agent(facts["agent"]), **places, **parts)
+        return cls(**{**facts, **parts, "agent": parse_agent(facts["agent"])})
 
 
 Results = Sequence[tuple[Cell, dict[str, Any]]]
