@@ -68,8 +68,7 @@ def initialize(module: nn.Module) -> nn.Module:
     for layer in module.modules():
         if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
             nn.init.orthogonal_(layer.weight)
-            if layer.bias is not None:
-                nn.init.zeros_(layer.bias)
+            nn.init.zeros_(layer.bias)
     return module
 
 
@@ -184,11 +183,9 @@ class MLP(nn.Sequential):
     """(batch, inputs) -> (batch, outputs): hidden layers 256, 256 with ReLU; tanh at the end if asked for."""
 
     def __init__(self, inputs: int, outputs: int, tanh: bool = False):
-        layers: list[nn.Module] = []
-        for width in HIDDEN:
-            layers += [nn.Linear(inputs, width), nn.ReLU()]
-            inputs = width
-        super().__init__(*layers, nn.Linear(inputs, outputs), *([nn.Tanh()] if tanh else []))
+        first, second = HIDDEN
+        hidden = nn.Linear(inputs, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU()
+        super().__init__(*hidden, nn.Linear(second, outputs), *([nn.Tanh()] if tanh else []))
         initialize(self)
 
 
