@@ -121,7 +121,11 @@ class Mpo(Learner):
         """The sum of all losses, (1): critics', policy's, temperature's and multipliers'; and what is to be logged."""
         settings = self.settings
         with torch.no_grad():
-            values, sampled, mean, std = self._target_values(next_observation)
+            mean, std = self.target_actor(next_observation)  # before tanh, as the sampled actions
+            sampled = mean + std * torch.randn(settings.action_samples, *mean.shape)  # (sample, n, action)
+            repeated = self.actor.normalize(next_observation).expand(len(sampled), -1, -1)
+            values = self.target(repeated.flatten(0, 1), torch.tanh(sampled).flatten(0, 1)).squeeze(-1)
+            values = values.mean(dim=0).view(len(sampled), -1)  # (sample, n), the mean of the critics
             target = reward + discount * values.mean(dim=0)
         value = self.critic(self.actor.normalize(observation), action).squeeze(-1)  # (critic, n)
         critic_loss = ((value - target) ** 2).mean(dim=1).sum()
@@ -141,24 +145,15 @@ class Mpo(Learner):
         logged = torch.stack([critic_loss, policy_loss, temperature, kl_mean, kl_std, std.mean()]).detach()
         return critic_loss + policy_loss + dual_loss, logged
 
-    def _target_values(self, observation):
-        """Q of actions drawn from the target policy, (sample, n); these actions before tanh; its mean and std."""
-        mean, std = self.target_actor(observation)
-        sampled = mean + std * torch.randn(self.settings.action_samples, *mean.shape)
-        repeated = self.actor.normalize(observation).expand(len(sampled), -1, -1)
-        values = self.target(repeated.flatten(0, 1), torch.tanh(sampled).flatten(0, 1)).squeeze(-1)
-        return values.mean(dim=0).view(len(sampled), -1), sampled, mean, std
-
     def update(self, batch: dict[str, torch.Tensor]) -> None:
         """One gradient step."""
         for optimizer in self.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
-        loss, logged = self._loss(*in_order(batch, self.settings.reward_scale))
+        loss, self._logged = self._loss(*in_order(batch, self.settings.reward_scale))
         loss.backward()
         for optimizer in self.optimizers.values():
             optimizer.step()
         self.updates += 1
-        self._logged = logged
         if self.updates % self.settings.target_period == 0:
             self.target.load_state_dict(self.critic.state_dict())
             self.target_actor.load_state_dict(self.actor.state_dict())

@@ -301,9 +301,7 @@ class CriticEnsemble(nn.Module):
       outputs: numbers that a critic gives: the logits of a distribution over returns, or one value.
     """
 
-    def __init__(
-        self, inputs: int, hidden: tuple[int, ...], critics: int = 2, outputs: int = 1, bfloat16: bool = False
-    ):
+    def __init__(self, inputs: int, hidden: tuple[int, ...], critics: int, outputs: int = 1, bfloat16: bool = False):
         super().__init__()
         self.bfloat16 = bfloat16
         sizes = (inputs, *hidden)
