@@ -34,7 +34,6 @@ from dmcvb_gen.policies.policy_file import load_policy, read_header, save_policy
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze, task_folder
 from dmcvb_gen.storage.errors import storage_errors
 from dmcvb_gen.tasks import get_task
-from dmcvb_gen.tasks.base import Task
 from dmcvb_gen.text import pluralize
 
 EXPERT_SHARE, MEDIUM_SHARE, MIXED_COUNT = 0.95, 0.5, 8
@@ -299,7 +298,9 @@ def select_checkpoints(
     folder = Path(folder)
     curve = read_curve(folder)
     task = get_task(read_header(curve[0][2]).task)
-    base = _base(task, episodes)
+    base = 0.0
+    if task.return_range[0] < 0:
+        base = evaluate(RandomPolicy(task), task, min(episodes, BASE_EPISODES), SEED, streams=FRESH).mean
     measured: dict[str, Policy] = {}
 
     def measure(path: Path) -> Evaluation:
@@ -320,13 +321,6 @@ def select_checkpoints(
         _write(folder, curve, selection, measured)
     plot_curve(folder, selection=selection)
     return selection
-
-
-def _base(task: Task, episodes: int) -> float:
-    """Return at 0 % of the way: that of random actions where returns may be negative, else 0."""
-    if task.return_range[0] >= 0:
-        return 0.0
-    return evaluate(RandomPolicy(task), task, min(episodes, BASE_EPISODES), SEED, streams=FRESH).mean
 
 
 def _write(folder: Path, curve: Sequence[Point], selection: Selection, policies: Mapping[str, Policy]) -> None:

@@ -28,7 +28,6 @@ class TaskVecEnv(VecEnv):
         super().__init__(size, seen, spaces.Box(task.action_low, task.action_high, dtype=np.float32))
 
     def reset(self) -> np.ndarray:
-        self.reset_infos = [{} for _ in range(self.num_envs)]
         settings, rng = EpisodeSettings(simulations=self.num_envs), np.random.default_rng(self._seed)
         self.episodes = Episodes(self.task, settings, self._seed, rng)
         return self.episodes.observation
