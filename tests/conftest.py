@@ -17,9 +17,9 @@ import pytest  # noqa: E402
 from click.testing import CliRunner  # noqa: E402
 
 from dmcvb_gen.cli import main  # noqa: E402
+from dmcvb_gen.dataset.chunks import decode  # noqa: E402
 from dmcvb_gen.dataset.gate import Release  # noqa: E402
 from dmcvb_gen.dataset.manifest import record_path  # noqa: E402
-from dmcvb_gen.dataset.chunks import decode  # noqa: E402
 from dmcvb_gen.dataset.writer import finish, put_shard  # noqa: E402
 from dmcvb_gen.generate.executors import run_works  # noqa: E402
 from dmcvb_gen.generate.plan import make_plan, start  # noqa: E402
