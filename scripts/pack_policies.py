@@ -7,17 +7,13 @@ python scripts/pack_policies.py                                        # the tab
 from __future__ import annotations
 
 import argparse
-import json
-import lzma
 import re
 import sys
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from dmcvb_gen.files import sha256_bytes
-from dmcvb_gen.policies.archives import INDEX, WORD, bundled_digests, bundled_file, data_folder, group_of, unpack_files
+from dmcvb_gen.policies.archives import bundled_digests, bundled_file, data_folder, pack
 from dmcvb_gen.policies.bundled import bundled_levels, bundled_names, level_files
 from dmcvb_gen.policies.paper import paper_returns
 from dmcvb_gen.policies.policy_file import read_header
@@ -42,35 +38,6 @@ OTHERS = {
 }
 """Returns of TD-MPC2 and SAC after a million frames, the mean of three seeds: results/ of
 github.com/nicklashansen/tdmpc2 at commit e9f5932."""
-
-
-def pack_files(contents: dict[str, bytes]) -> bytes:
-    """Pack safetensors files of float32 arrays, name -> bytes, into the bytes of one archive."""
-    ends = {name: WORD + int.from_bytes(content[:WORD], "little") for name, content in contents.items()}
-    index = [[name, content[: ends[name]].decode("latin-1"), len(content)] for name, content in contents.items()]
-    listing = json.dumps(index).encode()
-    weights = b"".join(content[ends[name] :] for name, content in contents.items())
-    planes = b"".join(weights[byte::4] for byte in range(4))
-    return lzma.compress(len(listing).to_bytes(WORD, "little") + listing + planes, preset=9 | lzma.PRESET_EXTREME)
-
-
-def pack(files: Mapping[str, bytes], out: Path) -> None:
-    """Put the policies of some tasks, "<task>/<file>" -> bytes, into archives and list; keep all others."""
-
-    def others(names: Iterable[str]) -> list[str]:
-        return [name for name in names if name.split("/")[0] not in tasks]
-
-    tasks, index = {name.split("/")[0] for name in files}, out / INDEX
-    for group in sorted(set(map(group_of, tasks))):
-        archive = out / f"{group}.xz"
-        old = unpack_files(archive.read_bytes()) if archive.exists() else {}
-        held = {name: old[name] for name in others(old)}
-        held |= {name: content for name, content in files.items() if group_of(name.split("/")[0]) == group}
-        archive.write_bytes(pack_files(dict(sorted(held.items()))))
-    listed = json.loads(index.read_text()) if index.exists() else {}
-    digests = {name: listed[name] for name in others(listed)}
-    digests |= {name: sha256_bytes(content) for name, content in files.items()}
-    index.write_text(json.dumps(dict(sorted(digests.items())), indent=1) + "\n")
 
 
 def picked_of(run: Path) -> dict[str, bytes]:

@@ -4,7 +4,7 @@
 network); `data/policies.json` lists them by their SHA-256. A file is unpacked once and checked at every use. An archive
 is xz over a list of the files' names and headers and, behind it, the bytes of all float32 weights: first all lowest
 bytes, then all second ones, ..., because signs and exponents resemble each other and noise does not.
-`scripts/pack_policies.py` makes the archives and adds the picks of runs.
+`scripts/pack_policies.py` adds the picks of runs.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import json
 import lzma
 import os
 import tempfile
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from dmcvb_gen.errors import DmcvbError
-from dmcvb_gen.files import sha256_if_readable, write_bytes
+from dmcvb_gen.files import sha256_bytes, sha256_if_readable, write_bytes
 from dmcvb_gen.spec import is_maze
 
 INDEX = "policies.json"
@@ -85,6 +86,16 @@ def _unpack(name: str) -> Path:
     )
 
 
+def pack_files(contents: dict[str, bytes]) -> bytes:
+    """Pack safetensors files of float32 arrays, name -> bytes, into the bytes of one archive."""
+    ends = {name: WORD + int.from_bytes(content[:WORD], "little") for name, content in contents.items()}
+    index = [[name, content[: ends[name]].decode("latin-1"), len(content)] for name, content in contents.items()]
+    listing = json.dumps(index).encode()
+    weights = b"".join(content[ends[name] :] for name, content in contents.items())
+    planes = b"".join(weights[byte::4] for byte in range(4))
+    return lzma.compress(len(listing).to_bytes(WORD, "little") + listing + planes, preset=9 | lzma.PRESET_EXTREME)
+
+
 def unpack_files(archive: bytes) -> dict[str, bytes]:
     """The files of an archive: name -> bytes."""
     content = lzma.decompress(archive)
@@ -97,3 +108,22 @@ def unpack_files(archive: bytes) -> dict[str, bytes]:
         files[name] = head.encode("latin-1") + weights[at : at + size - len(head)]
         at += size - len(head)
     return files
+
+
+def pack(files: Mapping[str, bytes], out: Path) -> None:
+    """Put the policies of some tasks, "<task>/<file>" -> bytes, into archives and list; keep all others."""
+
+    def others(names: Iterable[str]) -> list[str]:
+        return [name for name in names if name.split("/")[0] not in tasks]
+
+    tasks, index = {name.split("/")[0] for name in files}, out / INDEX
+    for group in sorted(set(map(group_of, tasks))):
+        archive = out / f"{group}.xz"
+        old = unpack_files(archive.read_bytes()) if archive.exists() else {}
+        held = {name: old[name] for name in others(old)}
+        held |= {name: content for name, content in files.items() if group_of(name.split("/")[0]) == group}
+        archive.write_bytes(pack_files(dict(sorted(held.items()))))
+    listed = json.loads(index.read_text()) if index.exists() else {}
+    digests = {name: listed[name] for name in others(listed)}
+    digests |= {name: sha256_bytes(content) for name, content in files.items()}
+    index.write_text(json.dumps(dict(sorted(digests.items())), indent=1) + "\n")

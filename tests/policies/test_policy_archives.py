@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 import shutil
 from pathlib import Path
 
@@ -13,13 +12,12 @@ from safetensors.numpy import save
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.files import sha256_file
 from dmcvb_gen.policies import archives
-from dmcvb_gen.policies.archives import bundled_digests, bundled_file
+from dmcvb_gen.policies.archives import bundled_digests, bundled_file, pack
 from dmcvb_gen.policies.bundled import bundled_levels, bundled_names
 from dmcvb_gen.policies.policy_file import read_header
 from dmcvb_gen.spec import MAZE_TRAINED_LEVELS, TRAINED_LEVELS, is_maze
 
 NAME = "walker-walk/expert.safetensors"
-pack = runpy.run_path(str(Path(__file__).parents[2] / "scripts/pack_policies.py"))["pack"]
 
 
 @pytest.fixture
