@@ -95,9 +95,9 @@ def open(
         from dmcvb_gen.loaders.painted import Painting, painted_release
 
         return painted_release(Release.open(path, storage_options, digest), Painting(**painting))
-    from dmcvb_gen.loaders.release import open_for_reading
+    from dmcvb_gen.loaders.release import ReleaseReader
 
-    return open_for_reading(path, storage_options, digest)
+    return ReleaseReader.open(path, storage_options, digest)
 
 
 register_with_gymnasium()  # so that gymnasium.make knows our names wherever this package is imported

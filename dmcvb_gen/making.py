@@ -94,14 +94,14 @@ def rollout(
     options = locals()
     from dmcvb_gen.generate.counts import check_room
     from dmcvb_gen.generate.plan import plan_of, run_plan, start
-    from dmcvb_gen.loaders.release import open_for_reading
+    from dmcvb_gen.loaders.release import ReleaseReader
 
     plan = plan_of(options)
     check_room(plan)
     start(plan, other_versions)
     with progress_bar(progress, f" {plan.unit}", plan.release.manifest.name) as bar:
         run_plan(plan, workers, bar)
-    return open_for_reading(plan.release.place if out is None else str(out), storage_options)
+    return ReleaseReader.open(plan.release.place if out is None else str(out), storage_options)
 
 
 class Made(NamedTuple):
@@ -143,7 +143,7 @@ def make(
     import numpy as np
 
     from dmcvb_gen.generate.request import EPISODES
-    from dmcvb_gen.loaders.release import open_for_reading
+    from dmcvb_gen.loaders.release import ReleaseReader
     from dmcvb_gen.loaders.union import UnionReader
     from dmcvb_gen.tasks import typed_task
 
@@ -156,7 +156,7 @@ def make(
     if release is not None:
         if options:
             raise DmcvbError(f"{min(options)} has no effect: with a release, nothing is made; remove it")
-        opened = open_for_reading(str(release))
+        opened = ReleaseReader.open(str(release))
     else:
         if taken := options.keys() & {"tasks", "levels", "distractors", "goals", "out"}:
             raise DmcvbError(f"make() decides {min(taken)} by the name {name!r}; remove it, or call rollout()")
@@ -275,14 +275,14 @@ def repaint(
     from dmcvb_gen.generate.repaint import Repainting
     from dmcvb_gen.generate.repaint import repaint as run
     from dmcvb_gen.generate.request import background_source
-    from dmcvb_gen.loaders.release import open_for_reading
+    from dmcvb_gen.loaders.release import ReleaseReader
 
     videos = None if backgrounds is None else background_source(backgrounds)
     setting = None if distractor is None else typed_setting(distractor)
     look = (setting, size, renderer, samples, videos, split, as_names(labels), name and check_name(name))
     with progress_bar(progress, " frames") as bar:
         run(Repainting(release, out, as_names(only), *look), workers, bar)
-    return open_for_reading(str(out))
+    return ReleaseReader.open(str(out))
 
 
 @checked

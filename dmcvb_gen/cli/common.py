@@ -106,11 +106,7 @@ def answer(as_json: bool, facts: Any, *lines: Any, code: int = 0) -> None:
 
 def print_json(value: Any) -> None:
     """Print a value as JSON; numpy numbers and paths are turned into plain ones."""
-    click.echo(json.dumps(value, indent=2, default=_plain))
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+    click.echo(json.dumps(value, indent=2, default=lambda it: it.tolist() if hasattr(it, "tolist") else str(it)))
 
 
 def moved_files(moved: Any) -> str:

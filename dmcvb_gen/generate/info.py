@@ -85,10 +85,9 @@ def _shipped_twin(name: str, digest: str | None) -> str | None:
     """Name and version of the shipped manifest of that name, if it has the digest."""
     from dmcvb_gen.generate.shipped import load_shipped, shipped_manifests
 
-    if name not in shipped_manifests():
-        return None
-    shipped = load_shipped(name)
-    return f"{name} {shipped.manifest.version}" if shipped.digest == digest else None
+    if name in shipped_manifests() and (shipped := load_shipped(name)).digest == digest:
+        return f"{name} {shipped.manifest.version}"
+    return None
 
 
 def describe_package() -> dict[str, Any]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from dmcvb_gen.dataset.gate import Release, Shard, read_recipes
+from dmcvb_gen.dataset.gate import Release, read_recipes
 from dmcvb_gen.dataset.manifest import VIDEOS, Layer, Resolved, SubsetRecord
 from dmcvb_gen.dataset.writer import begin, finish, put, put_record, read_checked, write_provenance, wrong_bytes
 from dmcvb_gen.errors import RecipeError, StoreError
@@ -29,7 +29,7 @@ from dmcvb_gen.generate.resolve import (
     rendering_facts,
     video_files,
 )
-from dmcvb_gen.generate.works import can_be_rendered, works_of
+from dmcvb_gen.generate.works import can_be_rendered, chosen_subsets, works_of
 from dmcvb_gen.options import refuse
 from dmcvb_gen.parallel import ProgressCallback, Workers, ignore
 from dmcvb_gen.spec import DistractorSetting, is_maze
@@ -78,8 +78,7 @@ def repaint(request: Repainting, workers: Workers | None = None, progress: Progr
       DmcvbError: nothing fits, two subsets would become one, a source shard is damaged, or `out` cannot be used.
     """
     store, release = open_store(local_path(request.out)), _source(request)
-    names = release.select(request.only)
-    chosen = not_imported(release, [record for record in release.manifest.subsets if record.name in names])
+    chosen = not_imported(release, chosen_subsets(release, request.only))
     files: dict[str, Path] = {}
     layers: dict[str, Layer] = {}
     records: dict[str, SubsetRecord] = {}
@@ -107,11 +106,11 @@ def repaint(request: Repainting, workers: Workers | None = None, progress: Progr
     write_provenance(store, "repaint")
     for shard in release.shards([record.name for record in chosen], images=False):
         if shard.here and layers.get(shard.layer.name) == bare(shard.layer):
-            _copy(release.store, store, shard)
+            for file in shard.files:
+                put(store, file.path, read_checked(release.store, file))
+            put_record(store, shard.layer, shard.number, shard.record)
     target = Release.in_making(store)
-
-    works = works_of(target, wanted=functools.partial(can_be_rendered, target))
-    for _ in run_works(works, workers, progress):
+    for _ in run_works(works_of(target, wanted=functools.partial(can_be_rendered, target)), workers, progress):
         pass
     return finish(store)
 
@@ -184,12 +183,6 @@ def _check_out(store: Store, resolved: Resolved) -> None:
     """Refuse a folder that holds any release but this very repaint, begun before."""
     there = read_recipes(store)
     if there and all(recipe.sha256 != resolved.sha256 for recipe in there):
-        held = f"{there[0].name} {there[0].version}"
-        raise StoreError(f"{store.place} holds {held}, which is not this repaint; give another --out")
-
-
-def _copy(source: Store, target: Store, shard: Shard) -> None:
-    """Copy the files of a shard, each compared with its digest, then its record."""
-    for file in shard.files:
-        put(target, file.path, read_checked(source, file))
-    put_record(target, shard.layer, shard.number, shard.record)
+        raise StoreError(
+            f"{store.place} holds {there[0].name} {there[0].version}, not this repaint; give another --out"
+        )

@@ -14,12 +14,12 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dmcvb_gen.dataset.manifest import Manifest, Resolved, canonical_json
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.files import parse_json, sha256_bytes
 
 if TYPE_CHECKING:
     from dmcvb_gen.dataset.gate import Release
-    from dmcvb_gen.dataset.manifest import Manifest, Resolved
 
 _FOLDER = resources.files("dmcvb_gen.generate") / "data" / "manifests"
 ENDING = ".json.xz"
@@ -43,8 +43,6 @@ class Shipped:
     @property
     def digest(self) -> str:
         """The release's digest."""
-        from dmcvb_gen.dataset.manifest import canonical_json
-
         return sha256_bytes(canonical_json(self.manifest))
 
 
@@ -61,8 +59,6 @@ def load_shipped(source: str | Path) -> Shipped:
       UnknownNameError: a plain name that is neither a file nor a shipped manifest's.
       StoreError: there is no such file, or it is no archive of a manifest.
     """
-    from dmcvb_gen.dataset.manifest import Manifest, Resolved
-
     path, name = Path(source), str(source)
     if not path.is_file() and (path.suffix or path.name != name):
         raise StoreError(f"{path} is no file; give an archive or a name: {', '.join(shipped_manifests())}")

@@ -6,7 +6,6 @@ import copy
 import importlib
 import inspect
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from dmcvb_gen.dataset.gate import Release
@@ -155,8 +154,3 @@ class ReleaseReader(Release):
           DmcvbError: they differ in task, setting, size or time limit, or have no episodes here.
         """
         return importlib.import_module("dmcvb_gen.loaders.union").UnionReader(self, [self[name] for name in names])
-
-
-def open_for_reading(path: str | Path, storage_options: dict | None = None, digest: str | None = None) -> ReleaseReader:
-    """See `dmcvb_gen.open`."""
-    return ReleaseReader.open(path, storage_options, digest)

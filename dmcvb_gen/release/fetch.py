@@ -67,9 +67,9 @@ def fetch(
         else; there is no room; access is refused.
     """
     download(locals())
-    from dmcvb_gen.loaders.release import open_for_reading  # Zarr, which the command does without
+    from dmcvb_gen.loaders.release import ReleaseReader  # Zarr, which the command does without
 
-    return open_for_reading(str(out))
+    return ReleaseReader.open(str(out))
 
 
 def download(given: Mapping[str, Any]) -> tuple[Moved, "RenderResult | None"]:

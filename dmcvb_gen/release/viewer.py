@@ -23,7 +23,7 @@ from dmcvb_gen.distractor_state import LABEL_DTYPES
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import sha256_bytes, write_bytes
 from dmcvb_gen.loaders.painted import Painting, painted_release
-from dmcvb_gen.loaders.release import SubsetReader, open_for_reading
+from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.options import Count, Local, Location, Names, checked, progress_bar
 from dmcvb_gen.release.export.episodes import entry_names
 from dmcvb_gen.storage.errors import storage_errors
@@ -92,7 +92,7 @@ def view(
     if not out and is_url(path):
         raise StoreError(f"{shown_place(path)} is a URL: say with --out where to write the file")
     target = local_path(out) if out else None
-    release = open_for_reading(path, storage_options)
+    release = ReleaseReader.open(path, storage_options)
     names = [name for name in release.select(as_names(only)) if name in release]
     if not names:
         raise StoreError(f"{shown_place(path)} has no finished episodes; run the rollout first")

@@ -115,7 +115,7 @@ def test_a_folder_with_another_release_is_left_alone(small_release, small_mazes,
         ("dynamic", dict(only=["*/*/none"], distractor="dynamic", labels=["depth"])),
     ):
         before = (tmp_path / folder / "manifest.json").read_bytes()
-        with pytest.raises(StoreError, match="is not this repaint; give another --out"):
+        with pytest.raises(StoreError, match="not this repaint; give another --out"):
             repaint(Repainting(small_release, tmp_path / folder, **request))
         assert (tmp_path / folder / "manifest.json").read_bytes() == before and verify(tmp_path / folder).sound
 

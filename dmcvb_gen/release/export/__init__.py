@@ -9,7 +9,7 @@ from typing import Any
 from dmcvb_gen.dataset.manifest import canonical_json
 from dmcvb_gen.errors import StoreError
 from dmcvb_gen.files import folder_in_the_making, parse_json, remove_partial, sha256_bytes, write_json
-from dmcvb_gen.loaders.release import SubsetReader, open_for_reading
+from dmcvb_gen.loaders.release import ReleaseReader, SubsetReader
 from dmcvb_gen.options import Local, Location, Names, Span, checked, progress_bar
 from dmcvb_gen.parallel import ProgressCallback, Workers, expect, ignore, in_order
 from dmcvb_gen.release.export.episodes import Source
@@ -80,7 +80,7 @@ def export(
     """
     kind, folder, path = get_format(to), Path(local_path(out)).absolute(), str(release)
     kind.check_installed()  # here, and not first in a worker
-    source = open_for_reading(path, storage_options)
+    source = ReleaseReader.open(path, storage_options)
     if not is_url(path) and Path(unpinned(path)).resolve() in (folder.resolve(), *folder.resolve().parents):
         raise StoreError(f"--out {folder} lies in the release itself; give another folder")
     asked = as_names(only)
@@ -126,7 +126,7 @@ def _episodes(subset: SubsetReader, asked: tuple[int, int] | None) -> tuple[int,
 
 def _write(work: _Work, tick: ProgressCallback = ignore) -> None:
     """Write one folder, whole or not at all."""
-    release = open_for_reading(work.path, work.storage_options)
+    release = ReleaseReader.open(work.path, work.storage_options)
     digest = sha256_bytes(canonical_json(work.stamp))
     source = Source(release, release[work.subset], list(work.episodes), tick, digest)
     kind, parent = get_format(work.to), work.folder.parent
