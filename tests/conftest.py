@@ -8,10 +8,12 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 os.environ.setdefault("MUJOCO_GL", "egl" if os.path.exists("/usr/lib/x86_64-linux-gnu/libEGL.so.1") else "disable")
 
+import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from click.testing import CliRunner  # noqa: E402
@@ -159,6 +161,22 @@ def python(source, *words, code=0, **options):
     done = subprocess.run(command, capture_output=True, text=True, **options)
     assert code in (None, done.returncode), (words, done.stdout, done.stderr)
     return done
+
+
+def wait(done, seconds=60):
+    """Wait until something is true, and say if it is."""
+    deadline = time.time() + seconds
+    while not done() and time.time() < deadline:
+        time.sleep(0.05)
+    return done()
+
+
+def posed(model, state, spec):
+    """MuJoCo's own data of a model at the beginning of a stored row, with all that follows from it."""
+    data = mujoco.MjData(model)
+    mujoco.mj_setState(model, data, state[: mujoco.mj_stateSize(model, spec)], spec)
+    mujoco.mj_forward(model, data)
+    return data
 
 
 def wrong_files(folder):

@@ -424,8 +424,7 @@ def test_an_option_that_an_agent_does_not_know_is_refused_with_those_that_it_tak
 # -- DINO -----------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def dino_file(tmp_path):
+def test_dino_gives_every_picture_of_a_stack_its_token_and_never_learns(tmp_path):
     """A tiny network of timm's class with random weights, in a file as timm's.
 
     A torchvision of another build than torch lacks these two operators, which nothing here calls.
@@ -437,11 +436,8 @@ def dino_file(tmp_path):
     transformers = pytest.importorskip("timm.models.vision_transformer")
     torch.manual_seed(0)
     sizes = dict(img_size=224, patch_size=16, embed_dim=64, depth=2, num_heads=1, mlp_ratio=2, num_classes=3)
-    save_file(transformers.VisionTransformer(**sizes).state_dict(), str(tmp_path / "dino.safetensors"))
-    yield tmp_path / "dino.safetensors"
-
-
-def test_dino_gives_every_picture_of_a_stack_its_token_and_never_learns(dino_file):
+    dino_file = tmp_path / "dino.safetensors"
+    save_file(transformers.VisionTransformer(**sizes).state_dict(), str(dino_file))
     encoder = DinoEncoder.load(dino_file, channels=9)
     observation = torch.rand(2, 9, 64, 64) - 0.5
     features = encoder(observation)

@@ -38,11 +38,6 @@ def make_data(stack=3, held=(False, True, False), size=SIZE):
     return TrainingData(StepTable(fields, LENGTHS, frames), np.array(held)).but(stack=stack)
 
 
-def pictures_of(data):
-    """(row, channel, size, size) uint8, without the border."""
-    return data.frames.table[..., PAD:-PAD].numpy()
-
-
 def by_hand(pictures, rows, down, right):
     """A stack padded by numpy and cut out."""
     stack = np.concatenate([pictures[row] for row in rows])
@@ -53,7 +48,7 @@ def by_hand(pictures, rows, down, right):
 
 def test_a_stack_is_the_last_frames_with_the_first_one_repeated_under_one_shift():
     data = make_data()
-    pictures = pictures_of(data)
+    pictures = data.frames.table[..., PAD:-PAD].numpy()  # without the border
     stacks = {0: (0, 0, 0), 1: (0, 0, 1), 2: (0, 1, 2), 5: (5, 5, 5), 6: (5, 5, 6), 12: (10, 11, 12), 14: (13, 13, 14)}
     rows = torch.tensor(list(stacks))
     generator = np.random.default_rng(0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 
-import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -20,6 +19,7 @@ from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.base import PHYSICS_SPEC
 from dmcvb_gen.tasks.cameras import camera_ids, centers_of_mass, matrices, nominal_cameras
 from dmcvb_gen.tasks.locomotion import WalkerWalk
+from tests.conftest import posed
 
 
 def physics_of(task, episodes=2, frames=41):
@@ -103,12 +103,10 @@ def test_the_camera_looks_where_the_nominal_one_does(task_id):
     task, frames = get_task(task_id), 40
     physics = physics_of(task, frames=frames)
     found = labels(task, "dynamic", physics)
-    data = mujoco.MjData(task.model)
     body = task.model.cam_bodyid[0]
     beside = []
     for episode, frame in np.ndindex(2, frames):
-        mujoco.mj_setState(task.model, data, physics[episode, frame], PHYSICS_SPEC)
-        mujoco.mj_forward(task.model, data)
+        data = posed(task.model, physics[episode, frame], PHYSICS_SPEC)
         center, nominal = data.subtree_com[body], data.cam_xpos[0]
         back = data.cam_xmat[0].reshape(3, 3)[:, 2]
         target = nominal - back * np.linalg.norm(center - nominal)

@@ -16,9 +16,6 @@ import signal
 import sys
 from collections.abc import Iterator
 
-MODES = ("kill", "full", "interrupt", "cut", "quota")
-"""kill: SIGKILL before the operation. full: it and all later ones that need room find none. interrupt: SIGINT.
-cut: killed while a file is written, at byte `at`. quota: no file can grow beyond byte `at`."""
 _CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link", "os.chmod", "os.utime"}
 _NEED_ROOM = {"open", "os.mkdir", "os.rename", "os.link"}
 
@@ -41,7 +38,8 @@ def arm(root: str, mode: str, at: int) -> None:
 
     Args:
       root: folder below which changes count.
-      mode: one of MODES.
+      mode: "kill": SIGKILL before the operation; "full": it and all later ones that need room find none; "interrupt":
+        SIGINT; "cut": killed while a file is written, at byte `at`; "quota": no file can grow beyond byte `at`.
       at: number of the change to strike at, from 0; of "cut" and "quota" the byte of a file.
     """
     if mode in ("cut", "quota"):

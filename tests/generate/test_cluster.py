@@ -29,20 +29,14 @@ def quick_recipe():
 
 
 @pytest.fixture(scope="module")
-def recipe_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("recipe") / "quick.json"  # which is YAML, too
-    path.write_text(json.dumps(quick_recipe().model_dump(mode="json", exclude_defaults=True)))
-    return path
-
-
-@pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The same release, made in one folder by one process."""
     return roll_out(quick_recipe(), tmp_path_factory.mktemp("whole") / "r")
 
 
-def test_parts_made_anywhere_give_the_files_of_one_rollout(whole, recipe_file, tmp_path):
-    place = tmp_path / "r"
+def test_parts_made_anywhere_give_the_files_of_one_rollout(whole, tmp_path):
+    place, recipe_file = tmp_path / "r", tmp_path / "quick.json"  # which is YAML, too
+    recipe_file.write_text(json.dumps(quick_recipe().model_dump(mode="json", exclude_defaults=True)))
     begun = told("cluster", "begin", "--recipe", recipe_file, "--out", place)
     assert begun["shards"] == 8
     run("cluster", "part", place, "1/8", "--workers", 1)

@@ -10,18 +10,10 @@ from dmcvb_gen.generate.modalities import get_modality
 from dmcvb_gen.generate.render import look
 from dmcvb_gen.tasks import PHYSICS_SPEC
 from dmcvb_gen.tasks.cameras import camera_ids, matrices
+from tests.conftest import posed
 from tests.rendering.test_rendering import frames_of, renderer_of
 
 SIZE = 64
-
-
-def pose(model, physics):
-    data = mujoco.MjData(model)
-    size = mujoco.mj_stateSize(model, PHYSICS_SPEC)
-    mujoco.mj_setState(model, data, physics[:size], PHYSICS_SPEC)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    return data
 
 
 def flow_by_rays(task, before, after, eye, next_eye, view, pixels):
@@ -63,7 +55,7 @@ def test_flow_is_that_of_points_on_mujocos_geoms(task_id, setting):
     turns = matrices(labels.camera_quaternion[:2, column])
     eyes = list(zip(labels.camera_position[:2, column].astype(float), turns, strict=True))
     pixels = rng.integers(0, SIZE, (300, 2))
-    poses = [pose(task.model, physics[i]) for i in range(2)]
+    poses = [posed(task.model, physics[i], PHYSICS_SPEC) for i in range(2)]
     expected, geoms = flow_by_rays(task, *poses, *eyes, column, pixels)
     same = geoms == segmentation[pixels[:, 0], pixels[:, 1]]
     assert same.mean() > 0.8  # sites, goals and mirror images apart

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from importlib.resources import files
 
 import numpy as np
@@ -29,7 +28,7 @@ from dmcvb_gen.policies.simulate import simulate
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.spec import LEVELS, is_maze
 from dmcvb_gen.tasks import get_task
-from tests.conftest import MAIN, invoke, maze_recipe, python, records, roll_out, short_recipe, small_recipe
+from tests.conftest import MAIN, invoke, maze_recipe, python, records, roll_out, short_recipe, small_recipe, wait
 from tests.faults.commands import GRACE, session
 from tests.faults.inject import files_up_to
 
@@ -111,16 +110,11 @@ def test_ctrl_c_ends_cleanly_leaves_no_process_and_says_how_to_go_on(tmp_path):
     command += ["--distractor", "dynamic", "--episodes", "40", "--episodes-per-shard", "1", "--workers", "2"]
     pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process = subprocess.Popen([*command, "--out", tmp_path / "r"], **pipes, start_new_session=True)
-    deadline = time.time() + 120
-    while not list((tmp_path / "r").glob("records/**/labels/*.json")) and time.time() < deadline:
-        time.sleep(0.05)
+    wait(lambda: list((tmp_path / "r").glob("records/**/labels/*.json")), 120)
     assert len(session(process.pid)) >= 3
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
-    deadline = time.time() + GRACE
-    while session(process.pid) and time.time() < deadline:
-        time.sleep(0.05)
-    assert not session(process.pid)
+    assert wait(lambda: not session(process.pid), GRACE)
     assert process.returncode != 0 and "rerun the same command to go on" in errors
     assert "Traceback" not in errors and "pending" not in errors
     assert len(Release.open(tmp_path / "r").subsets) >= 1

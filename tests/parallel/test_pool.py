@@ -12,6 +12,7 @@ import pytest
 from dmcvb_gen.errors import StoreError, UnknownNameError
 from dmcvb_gen.parallel import in_order, open_pool
 from dmcvb_gen.parallel.base import IN_FLIGHT
+from tests.conftest import wait
 
 
 def square(number, tick):
@@ -36,14 +37,6 @@ def fail_oddly(number, tick):
 
 def die(number, tick):
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def wait(done, seconds=60):
-    """Wait until something is true, and say if it is."""
-    deadline = time.time() + seconds
-    while not done() and time.time() < deadline:
-        time.sleep(0.05)
-    return done()
 
 
 def ended(pids):

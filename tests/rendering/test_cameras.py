@@ -3,13 +3,12 @@
 import copy
 from concurrent.futures import ThreadPoolExecutor
 
-import mujoco
 import numpy as np
 import pytest
 
 from dmcvb_gen.tasks import cameras, get_task
 from dmcvb_gen.tasks.cameras import Kinematics, centers_of_mass, nominal_cameras
-from tests.conftest import TINY_MAZE
+from tests.conftest import TINY_MAZE, posed
 from tests.distractors.test_distractors import physics_of
 from tests.tasks import hostile_tasks as h
 from tests.tasks.test_own_tasks import task_of
@@ -23,11 +22,10 @@ def test_poses_are_mujocos_and_do_not_depend_on_the_frames_beside_them(task):
     task = get_task(task) if isinstance(task, str) else task_of(task)
     physics = physics_of(task, 5, 4)[:, -1]
     together = Kinematics(task)(physics, FIELDS)
-    data, model = mujoco.MjData(task.model), copy.deepcopy(task.model)
+    model = copy.deepcopy(task.model)
     for frame, state in enumerate(physics):
         task.apply_entries(model, state)
-        mujoco.mj_setState(model, data, state[: mujoco.mj_stateSize(model, task.physics_spec)], task.physics_spec)
-        mujoco.mj_forward(model, data)
+        data = posed(model, state, task.physics_spec)
         alone = Kinematics(task)(state[None], FIELDS)
         for name in FIELDS:
             expected = getattr(data, name)

@@ -22,6 +22,7 @@ from dmcvb_gen.rendering import opengl, renderer_class
 from dmcvb_gen.tasks import LOCOMOTION_TASKS, get_task
 from dmcvb_gen.tasks.environment import EnvironmentTask
 from dmcvb_gen.tasks.own import mjcf_environment
+from tests.conftest import posed
 from tests.rendering.test_rendering import drawn_labels, frames_of, needs_opengl
 
 SKY = '<texture type="skybox" builtin="gradient" rgb1=".4 .6 .8" rgb2="0 0 0" width="128" height="128"/>'
@@ -285,9 +286,7 @@ def test_every_pixel_shows_the_geom_that_mujocos_ray_meets(name, share, rtol, tm
     task, physics = task_of(tmp_path, model("cylinder", world=FLOOR + others))
     renderer = renderer_class(name)(task, 64)
     found = renderer.render_labels(physics[:1], labels_of(task, physics[:1]))
-    world, data = task.model, mujoco.MjData(task.model)
-    mujoco.mj_setState(world, data, physics[0, : mujoco.mj_stateSize(world, task.physics_spec)], task.physics_spec)
-    mujoco.mj_forward(world, data)
+    world, data = task.model, posed(task.model, physics[0], task.physics_spec)
     slope = np.tan(np.radians(world.cam_fovy[0]) / 2) * ((np.arange(64) + 0.5) / 32 - 1)
     met, meters = np.full((64, 64), -1), np.zeros((64, 64))
     for row, column in np.ndindex(64, 64):
