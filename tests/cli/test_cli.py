@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import dmcvb_gen
 from dmcvb_gen.cli import main
 from dmcvb_gen.cli.common import INTERRUPTED
 from dmcvb_gen.dataset.gate import Release
@@ -175,22 +174,6 @@ def test_videos_that_are_kept_for_evaluation_are_counted(tmp_path, count):
     assert ("2 of 3 videos" in note and "--split val" in note) == (count == 3)
 
 
-SWING = """
-import numpy as np
-
-def swing(observations, generator):
-    return generator.normal(size=(len(observations), 6)).clip(-1, 1)
-"""
-
-
-def test_a_function_of_ones_own_is_named_beside_its_returns(tmp_path, monkeypatch):
-    (tmp_path / "swinging.py").write_text(SWING)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DMCVB_GEN_BEHAVIOURS", raising=False)
-    shown = said("evaluate-behaviour", "walker-walk", "--behaviour", "swinging:swing", "--episodes", 2)
-    assert "swinging:swing" in shown and "mean actions" not in shown
-
-
 @pytest.mark.slow
 def test_a_selection_that_picks_nothing_says_why_wherever_one_looks(tmp_path):
     settings = [f"--set={pair}" for pair in ("warmup_steps=100", "compile=false", "batch_size=16")]
@@ -226,23 +209,3 @@ def test_listed_values_are_the_tasks_and_those_given(tmp_path):
     assert (maze["simulations"]["value"], maze["critics"]["value"]) == (16, 3)
     (tmp_path / "ring.txt").write_text("****\n*  *\n****\n")  # a maze of one's own is learned by `guided`
     assert "half_life=12500" in said("train-behaviour", tmp_path / "ring.txt", "--list-settings")
-
-
-READ = """
-import sys, dmcvb_gen
-subset = dmcvb_gen.open(sys.argv[1])["walker-walk/random/none"]
-try:
-    [subset.source(stack=3)[step] for step in range(8)]
-except dmcvb_gen.errors.StoreError as error:
-    print("caught", error)
-"""
-
-
-def test_a_damaged_chunk_is_one_line_in_python(tmp_path):
-    dmcvb_gen.rollout("walker-walk", levels="random", episodes=2, max_steps=4, out=tmp_path / "r", progress=False)
-    [path] = [path for path in tmp_path.rglob("none/pixels/c/**/*") if path.is_file()]
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 255
-    path.write_bytes(data)
-    read = python(READ, tmp_path / "r")
-    assert read.stdout.startswith("caught") and "Stored:" not in read.stdout and read.stderr == ""

@@ -26,7 +26,7 @@ def test_tables_fit_80_columns_and_cut_no_word(small_release, small_mazes, tmp_p
         ("list",): ["ant-maze-medium7x7a", "bundled behaviours", "dmcvb-mini"],
         ("info", small_release): ["walker-walk/random/dynamic", "episodes", "mean"],
         ("info", small_mazes): ["ant-maze-tiny/random/visible", "episodes", "mean"],
-        tuple(evaluate): ["ant-maze-medium7x7a", "success", "DMC-VB paper"],
+        tuple(evaluate): ["ant-maze-medium7x7a", "success", "to goal m/s", "DMC-VB paper"],
         ("rollout", "walker-walk", "--distractor", "static", *plan): ["walker-walk/random/", "to make"],
         ("rollout", "ant-maze-medium7x7a", *plan): ["ant-maze-medium7x7a/random/", "to make"],
     }

@@ -55,6 +55,7 @@ def test_two_episodes_of_every_subset_of_a_shipped_recipe_are_planned_made_and_s
     for task in lacking:
         refused = invoke("rollout", "--recipe", name, task, *TINY, "--out", tmp_path / "r", "--dry-run", code=2).output
         assert refused.count("\n") == 1 and f"`dmcvb-gen train-behaviour {task} && " in refused, refused
+        assert f"select-checkpoints runs/{task}`, then give --behaviour runs/{task}" in refused
     tasks = sorted({request.task for request in wanted.values()} - lacking)
     cut = ["rollout", "--recipe", name, *tasks, *TINY, "--out", tmp_path / "r", "--json"]
     invoke(*cut, "--dry-run", code=0)

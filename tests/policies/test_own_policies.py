@@ -155,6 +155,12 @@ def test_data_of_a_function_are_verified_regenerated_and_marked(task, code, tmp_
     assert told("verify", tmp_path / "r")["sound"]
 
 
+@pytest.mark.slow_cases("maze")
+def test_a_function_of_ones_own_is_named_beside_its_returns(task, code):
+    shown = run("evaluate-behaviour", task.id, "--behaviour", f"{code}:noisy", "--episodes", 2)
+    assert f"{code}:noisy" in shown and "mean actions" not in shown
+
+
 def test_names_that_may_run_are_listed_as_people_list_them(code, monkeypatch):
     monkeypatch.setenv(BEHAVIOURS, f" other:f, {code}:noisy,, ")
     assert callable(find_function(f"{code}:noisy", BEHAVIOURS, "behaviour"))
@@ -505,7 +511,6 @@ def test_a_policy_without_noise_is_not_sampled(plain, tmp_path):
         ("plain.pt/x.safetensors", "choose a place that you may write to"),
         ("folder.safetensors", "cannot write to"),
         ("plain.pt", "for another program's file; end its name in .safetensors"),
-        ("plain.zip", "for another program's file; end its name in .safetensors"),
     ],
 )
 def test_places_that_no_policy_can_be_written_to_are_one_line(plain, out, words, tmp_path):
@@ -543,6 +548,3 @@ def test_one_checkpoint_of_a_run_is_named_by_its_step(tmp_path, caplog):
     (run / "checkpoints" / "0000001200.safetensors").unlink()
     with pytest.raises(DmcvbError, match="has no checkpoint yet"):
         resolve_policies(WALKER, "expert", f"{run}@latest")
-
-
-# -- returns --------------------------------------------------------------------------------------

@@ -46,12 +46,6 @@ def test_speed_is_meters_a_second_of_the_ants_that_got_there():
     assert goal_scores(get_task("walker-walk"), start, length, length) == (None, None)
 
 
-@pytest.mark.slow
-def test_mazes_have_scores_of_their_own():
-    tasks = ("ant-maze-easy7x7a", "walker-walk")
-    assert "to goal m/s" in run("evaluate-behaviour", *tasks, "--level", "random", "--episodes", 2)
-
-
 @pytest.mark.full
 def test_one_command_sets_every_bundled_level_beside_the_paper():
     rows = told("evaluate-behaviour", "--episodes", 2)
