@@ -1,6 +1,6 @@
 """Digests of one short episode a task, as JSON: run by test_same_bits.py here and under emulated processors.
 
-python -m tests.same_bits <agent steps> <renderer or -> <task>...
+python -m tests.same_bits <agent steps> <task>...
 """
 
 import hashlib
@@ -13,6 +13,7 @@ from dmcvb_gen.distractors import load_backgrounds, sample_distractors
 from dmcvb_gen.policies.bundled import bundled_policies
 from dmcvb_gen.policies.policy_file import load_policy
 from dmcvb_gen.policies.simulate import simulate
+from dmcvb_gen.rendering import renderer_class
 from dmcvb_gen.seeding import STREAMS, episode_stream
 from dmcvb_gen.spec import LOCOMOTION, parse_setting
 from dmcvb_gen.tasks import get_task
@@ -27,7 +28,7 @@ def digest(*arrays: np.ndarray) -> str:
     return sha.hexdigest()[:16]
 
 
-def digests(task_id: str, steps: int, renderer: str | None) -> dict[str, str]:
+def digests(task_id: str, steps: int) -> dict[str, str]:
     """Of what an expert's episodes store: mean and drawn actions, physics, states, rewards, labels, pictures."""
     task = get_task(task_id)
     policy = load_policy(bundled_policies(task_id, "expert")[0], task)
@@ -49,16 +50,12 @@ def digests(task_id: str, steps: int, renderer: str | None) -> dict[str, str]:
         backgrounds = load_backgrounds("builtin", "train") if distractors.kind != "none" else None
         labels = sample_distractors(task, distractors, physics, streams, backgrounds, split="train")
         found[f"labels {setting}"] = digest(*(value for _, value in labels.items()))
-        if renderer:
-            from dmcvb_gen.rendering import renderer_class
-
-            painter = renderer_class(renderer)(task, 64, backgrounds=backgrounds)
-            frames = painter.render(start, labels[:, 0])
-            found[f"pictures {setting}"] = digest(frames)
-            painter.close()
+        painter = renderer_class("native")(task, 64, backgrounds=backgrounds)
+        found[f"pictures {setting}"] = digest(painter.render(start, labels[:, 0]))
+        painter.close()
     return found
 
 
 if __name__ == "__main__":
-    given, painter, *tasks = sys.argv[1:]
-    print(json.dumps({task: digests(task, int(given), None if painter == "-" else painter) for task in tasks}))
+    given, *tasks = sys.argv[1:]
+    print(json.dumps({task: digests(task, int(given)) for task in tasks}))

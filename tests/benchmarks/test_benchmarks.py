@@ -10,7 +10,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from safetensors.torch import save_file
 
 from dmcvb_gen import own_code
@@ -35,6 +34,7 @@ from dmcvb_gen.parallel.ray_pool import share_of_node
 from dmcvb_gen.storage.store import open_store
 from dmcvb_gen.tasks import get_task
 from tests.conftest import small_recipe
+from tests.distractors.test_backgrounds import write_frames
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples" / "extending"
 
@@ -285,9 +285,7 @@ def test_what_a_score_hangs_on_besides_the_data_is_in_its_fingerprint(small_rele
     release, weights = Release.open(small_release), tmp_path / "dino.safetensors"
     cells = {c.agent.name: c for c in plan_benchmark("b1", release, ["dino+bc", "id+bc", "bc", "state-bc"])[0]}
     cells |= {"encoder": cells["id+bc"].encoder}
-    own = tmp_path / "clips" / "val" / "one"
-    own.mkdir(parents=True)
-    Image.fromarray(np.full((8, 8, 3), 200, np.uint8)).save(own / "0.png")
+    write_frames(tmp_path / "clips" / "val" / "one", [np.full((8, 8, 3), 200, np.uint8)], "png")
     save_file({"x": torch.zeros(1)}, str(weights))
     save_file({"x": torch.ones(1)}, str(tmp_path / "other.safetensors"))
     plain = dataclasses.replace(SMOKE, dino_weights=str(weights))

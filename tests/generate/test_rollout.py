@@ -238,7 +238,6 @@ def test_a_recipe_is_narrowed_to_what_has_the_asked_names():
         (b"a: b: c", "not YAML"),
         (b"", "holds no recipe; begin it with"),
         (TWICE.encode(), r"subsets is given twice \(line 7\); keep one$"),
-        (b"name: mine\nsubsets:\n- tasks: walker-walk\n  tasks: cheetah-run\n", r"tasks is given twice \(line 4\)"),
     ],
 )
 def test_what_is_no_recipe_is_refused_in_a_line(tmp_path, content, why):

@@ -17,8 +17,6 @@ from pathlib import Path
 
 import pytest
 
-from dmcvb_gen.rendering import RENDERERS
-
 TASKS = ("walker-walk", "cheetah-run", "humanoid-walk", "ant-maze-empty7x7")
 STEPS = 3
 PLAIN = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
@@ -33,7 +31,6 @@ ALIKE = {"Haswell-v4": {}, "SandyBridge": PLAIN}
 """What else a process here needs to be like the model."""
 OURS = {name: value for name, value in os.environ.items() if name != "OPENBLAS_CORETYPE"}
 """Without what makes BLAS take another processor's functions: a model would stop at what it does not have."""
-PAINTER = "native" if "native" in RENDERERS else "-"
 
 pytestmark = [
     pytest.mark.full,
@@ -43,7 +40,7 @@ pytestmark = [
 
 def digests(model: str | None, environment: dict[str, str]) -> dict:
     """Task -> name -> digest, as a process prints them, under an emulated processor if a model is named."""
-    command = [sys.executable, "-m", "tests.same_bits", str(STEPS), PAINTER, *TASKS]
+    command = [sys.executable, "-m", "tests.same_bits", str(STEPS), *TASKS]
     command = command if model is None else [shutil.which("qemu-x86_64"), "-cpu", model, *command]
     variables = OURS | {"OMP_NUM_THREADS": "1"} | environment
     done = subprocess.run(command, cwd=Path(__file__).parents[2], env=variables, capture_output=True, text=True)

@@ -138,5 +138,3 @@ def test_painted_episodes_are_kept_while_there_is_room(painted_and_light):
 def test_a_way_of_painting_that_there_is_not_is_refused(painted_and_light):
     with pytest.raises(DmcvbError, match="resample"):
         dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractors="new")
-    with pytest.raises(TypeError, match="distractor"):
-        dmcvb_gen.open(str(painted_and_light / "light"), paint=True, distractor="resample")

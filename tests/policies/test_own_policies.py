@@ -274,7 +274,6 @@ class Doubled(FlattenExtractor):
     ("algorithm", "kwargs", "space", "words"),
     [
         (SAC, {}, {"low": 0.0}, "acts from [0.0, 0.0"),
-        (TD3, {}, {"high": 2.0}, "train it with the task's own bounds"),
         (PPO, {"n_steps": 8, "batch_size": 8}, {"low": -2.0, "high": 2.0}, "acts from [-2.0, -2.0"),
         (SAC, {"policy_kwargs": {"features_extractor_class": Doubled}}, {}, "a features extractor (Doubled)"),
         (PPO, {"n_steps": 8, "batch_size": 8, "use_sde": True}, {}, "use_sde"),

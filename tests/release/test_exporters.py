@@ -282,7 +282,6 @@ def test_of_unfinished_releases_only_the_same_one_counts_as_exported(tmp_path):
 MISTAKES = {
     "no format": (dict(to="csv"), UnknownNameError, "lerobot"),
     "a reader's name": (dict(to="tfds"), DmcvbError, "unknown format 'tfds'. Did you mean 'rlds'?"),
-    "no subset": (dict(only=["cheetah-run"]), UnknownNameError, "walker-walk/random/none"),
     "no episodes": (dict(episode_range=(50, 60)), StoreError, "none of the episodes 50:60"),
     "no package": (dict(to="hdf5"), DmcvbError, "h5py.*: pip install h5py"),
 }

@@ -135,10 +135,7 @@ def test_a_background_on_the_sky_is_what_pillow_makes_of_it(shape):
     np.testing.assert_array_equal(found, np.concatenate([packed(level) for level in levels(last)[1:]]))
 
 
-@pytest.mark.slow
-def test_what_it_does_not_paint_is_refused():
-    with pytest.raises(RenderingError, match="dog-walk has geoms of type mesh, .* use --renderer opengl"):
-        renderer_class("native")(get_task("dog-walk"), 64)
+def test_it_takes_four_samples_a_pixel_alone():
     with pytest.raises(RenderingError, match="4 samples"):
         renderer_class("native")(get_task("walker-walk"), 64, samples=2)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dmcvb_gen.distractors import DistractorSetting, floor_alpha_for, load_backgrounds, sample_distractors
-from dmcvb_gen.generate.renderer_choice import default_renderer
 from dmcvb_gen.rendering import available_renderers, renderer_class
 from dmcvb_gen.rendering.opengl import unavailable
 from dmcvb_gen.seeding import STREAMS, episode_stream
@@ -129,8 +128,3 @@ def test_every_renderer_has_its_contract_and_says_why_it_cannot_start():
     assert {tests.name for tests in RendererTests.__subclasses__()} == set(available_renderers())
     found = available_renderers()
     assert found["native"] is None and (found["opengl"] is None or "libegl1" in found["opengl"])
-
-
-def test_what_native_does_not_paint_is_painted_by_another_renderer():
-    assert default_renderer(get_task("quadruped-walk")) == "native"
-    assert default_renderer(get_task("lqr-lqr_2_1")) == "opengl"

@@ -6,8 +6,8 @@ import copy
 import dataclasses
 import functools
 import random
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -203,22 +203,19 @@ def test_what_a_task_keeps_late_in_an_episode_does_not_reach_the_next_one():
 
 
 def test_environments_in_threads_leave_every_generator_as_it_was():
-    task, done = task_of(h.plain), []
+    task = task_of(h.plain)
 
-    def play():
+    def play(_):
         batch, rng = task.batch(2), np.random.default_rng(3)
         batch.alone = False
         for _ in range(20):
             batch.reset([np.random.default_rng(place) for place in range(2)])
             batch.step(rng.uniform(-1, 1, (2, 2)))
             np.random.rand(3)
-        done.append(len({np.random.default_rng().integers(2**60) for _ in range(5)}))
+        return len({np.random.default_rng().integers(2**60) for _ in range(5)})
 
-    threads = [threading.Thread(target=play) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as pool:
+        done = list(pool.map(play, range(4)))
     assert done == [5] * 4 and np.random.default_rng().integers(2**60) != np.random.default_rng().integers(2**60)
 
 

@@ -84,7 +84,6 @@ MISTAKES = [
     ("walker-walk --algo dreamer", "Known: guided, mpo, sac, sb3:PPO, sb3:SAC, sb3:TD3."),
     ("walker-walk --set learning_rat=3", "Did you mean 'learning_rate'?"),
     ("walker-walk --algo sb3:PPO --set buffer_size=3", "clip_range"),
-    ("walker-walk --algo sb3:PPPO", "Did you mean 'PPO'?"),
     ("walker-walk --algo sb3:SAC --set optimize_memory_usage=true", "unknown setting of sb3:SAC"),
     ("walker-walk --set foo=1", "more; --list-settings lists them all."),
     ("walker-walk --set speed", "key=value"),
@@ -100,7 +99,6 @@ MISTAKES = [
     ("cheetah-run --set shaping=0.1", "setting shaping is only for humanoid-walk and ant mazes"),
     ("fish-swim --set standing_starts=0.1", "only for bodies that move freely"),
     ("walker-walk --algo guided", "for ant mazes"),
-    ("ant-maze-easy7x7a --algo guided --set path_reward_scale=1", "unknown setting of guided"),
 ]
 
 
