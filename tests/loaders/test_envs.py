@@ -180,6 +180,7 @@ MISTAKES = [
     ((MAZE, "fixed"), {"goal_pair": 7, "fixed_goals": 3}, "goal_pair is 7; give 0 to 2"),
     ((MAZE, "visible"), {"views": ()}, "views is empty"),
     (("walker-walk",), {"modalities": "flow"}, "has no flow"),
+    (("lqr-lqr_2_1",), {}, "has transparent bodies, which 'native' does not paint"),
     (("dog-walk",), {}, "has geoms of type mesh, .* does not paint; use renderer opengl"),
 ]
 

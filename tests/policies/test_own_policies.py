@@ -184,18 +184,15 @@ def test_other_code_of_the_same_name_is_refused(code, task, tmp_path, monkeypatc
     run("rollout", task.id, *TINY, *again)
 
 
-@pytest.mark.parametrize(
-    "text, told", [("def f(o, g)\n", "SyntaxError"), ("raise RuntimeError('boo')", "RuntimeError: boo")]
-)
 @pytest.mark.parametrize("place", ["task", "behaviour"])
-def test_code_that_cannot_be_imported_is_told_in_one_line(place, text, told, tmp_path, monkeypatch):
-    name = f"bad_{place}_{told[:5].lower()}"
-    (tmp_path / f"{name}.py").write_text(text)
+def test_code_that_cannot_be_imported_is_told_in_one_line(place, tmp_path, monkeypatch):
+    name = f"bad_{place}"
+    (tmp_path / f"{name}.py").write_text("def f(o, g)\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(BEHAVIOURS, "")
     monkeypatch.setenv(TASKS_VARIABLE, "")
     asked = [f"{name}:f"] if place == "task" else [WALKER, "--level", "expert", "--behaviour", f"{name}:f"]
-    assert f"{place} {name}:f cannot be imported ({told}" in refused("rollout", *asked, "--out", tmp_path / "r")
+    assert f"{place} {name}:f cannot be imported (SyntaxError" in refused("rollout", *asked, "--out", tmp_path / "r")
 
 
 @pytest.mark.parametrize(
