@@ -26,6 +26,8 @@ PROBE_SECONDS = 2.0
 PROBED_STEPS = 10_000
 """Shorter runs are not: they are over soon."""
 BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+PAUSE = 10.0
+"""Seconds without a step, as while updates are compiled, that say nothing of the time left."""
 
 
 @dataclass(frozen=True)
@@ -225,9 +227,18 @@ def _train(run: "Run", done: int, progress: bool, notify: Callable[[str], None])
     name, expert = task_folder(run.config.task), paper_returns(run.config.task, "expert")
     work: dict[str, Any] = dict(total=run.config.steps, initial=done, smoothing=0, unit=" steps", unit_scale=True)
     with ProgressBar(progress, **work, desc=name, bar_format=BAR) as bar, generators_kept():
+        last = time.monotonic()
+
+        def tick(steps: int) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if now - last > PAUSE and not bar.disable:
+                bar.unpause()
+            bar.update(steps)
+            last = now
 
         def report(evaluation: Any) -> None:
             beside = f"/{expert['mean']:.0f}" if expert else ""
             bar.set_postfix_str(f"return {evaluation.mean:.0f}{beside}", refresh=False)
 
-        run.train(report, bar.update, lambda: notify("\nStopping: the run is being saved."))
+        run.train(report, tick, lambda: notify("\nStopping: the run is being saved."))

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from types import SimpleNamespace
 
 import click
 import numpy as np
@@ -14,6 +15,7 @@ from dmcvb_gen.policies.archives import bundled_digests
 from dmcvb_gen.policies.bundled import bundled_levels, bundled_policies
 from dmcvb_gen.policies.evaluation import goal_scores
 from dmcvb_gen.policies.paper import paper_returns
+from dmcvb_gen.progress import ProgressBar
 from dmcvb_gen.tasks import get_task
 from dmcvb_gen.training import behaviour
 from dmcvb_gen.training.behaviour import plan_of, run_config
@@ -142,6 +144,21 @@ def test_short_runs_are_not_tried_and_what_is_done_is_said(tmp_path, monkeypatch
     monkeypatch.setattr(behaviour, "probe", lambda run: pytest.fail("tried"))
     said = lines_of(tmp_path, "acrobot-swingup", steps=9_000, done=6_000)
     assert said == ["acrobot-swingup, sac, float32: 9,000 agent steps, 6,000 of them done."]
+
+
+def test_a_pause_says_nothing_of_the_time_left(tmp_path, monkeypatch):
+    """Compiling the updates takes a minute, in which eight steps are made."""
+    resumed, clock = [], iter([0.0, 0.1, 70.0, 70.1, 70.2])
+
+    def train(report, tick, stopping):
+        for _ in range(4):
+            tick(8)
+
+    run = SimpleNamespace(config=SimpleNamespace(steps=32, task="walker-walk"), train=train)
+    monkeypatch.setattr(ProgressBar, "unpause", lambda bar: resumed.append(bar.n))
+    monkeypatch.setattr(behaviour, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    behaviour._train(run, 0, True, lambda line: None)
+    assert resumed == [8]
 
 
 def own_task(folder, module, seconds):
