@@ -238,6 +238,8 @@ def _train(run: "Run", done: int, progress: bool, notify: Callable[[str], None])
             last = now
 
         def report(evaluation: Any) -> None:
+            nonlocal last
+            last = time.monotonic()  # an evaluation is no pause: others follow, and take as long
             beside = f"/{expert['mean']:.0f}" if expert else ""
             bar.set_postfix_str(f"return {evaluation.mean:.0f}{beside}", refresh=False)
 

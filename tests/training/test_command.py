@@ -147,12 +147,14 @@ def test_short_runs_are_not_tried_and_what_is_done_is_said(tmp_path, monkeypatch
 
 
 def test_a_pause_says_nothing_of_the_time_left(tmp_path, monkeypatch):
-    """Compiling the updates takes a minute, in which eight steps are made."""
-    resumed, clock = [], iter([0.0, 0.1, 70.0, 70.1, 70.2])
+    """Compiling the updates takes a minute, in which eight steps are made; evaluations are part of the work."""
+    resumed, clock = [], iter([0.0, 0.1, 70.0, 70.1, 100.0, 100.1])
 
     def train(report, tick, stopping):
-        for _ in range(4):
+        for _ in range(3):
             tick(8)
+        report(SimpleNamespace(mean=1.0))
+        tick(8)
 
     run = SimpleNamespace(config=SimpleNamespace(steps=32, task="walker-walk"), train=train)
     monkeypatch.setattr(ProgressBar, "unpause", lambda bar: resumed.append(bar.n))
