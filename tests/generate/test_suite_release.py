@@ -42,5 +42,5 @@ def test_a_suite_task_goes_the_whole_way(task_id, tmp_path):
     env = DistractedEnv(task_id, "dynamic", size=SIZE, renderer=default_renderer(task))
     observation, _ = env.reset(seed=0)
     observation, reward, *_ = env.step(np.zeros(task.action_size, np.float32))
-    assert np.isfinite(reward) and observation is not None
+    assert np.isfinite(reward) and np.isfinite(observation["state"]).all()
     env.close()
