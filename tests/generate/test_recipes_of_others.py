@@ -39,7 +39,7 @@ def test_laom_has_its_action_repeat_its_videos_and_its_episodes():
     recipe = load_recipe("laom")
     assert recipe.action_repeat == 1 and recipe.split == "train"
     for request in expand(recipe):
-        setting = request.spec.distractor
+        setting = DistractorSetting.parse(request.setting)
         assert (request.episodes, request.max_steps, setting.kind, setting.videos) == (5_000, 1_000, "dynamic", 60)
         assert all(setting.scale_of(part) == 0.1 for part in ("camera", "color"))
 
