@@ -131,7 +131,7 @@ def _wrong_usage(error: click.UsageError) -> str:
     """Say in one line what is wrong with a command line. Messages of click get the help to read; ours name the cure."""
     command = error.ctx.command_path if error.ctx else "dmcvb-gen"
     ours = type(error) is click.UsageError and not error.message.startswith("Got unexpected")
-    message = error.format_message().rstrip(".")
+    message = error.format_message().rstrip(".?")
     message = message[:1].lower() + message[1:]
     return error.message if ours else f"{message}; see `{command} --help`"
 

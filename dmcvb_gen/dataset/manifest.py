@@ -99,7 +99,7 @@ class ArraySpec(_Model):
       dims: names of the axes of `shape`.
       steps: True if the array has a step axis.
       chunk_steps: steps of one chunk, the unit of reading; None: all steps of an episode.
-      codec: how a chunk becomes bytes, see `schema.codecs`.
+      codec: how a chunk becomes bytes, see `schema.array_metadata`.
       attributes: stored with the array, e.g. the fields of a state or the bounds of an action.
     """
 
