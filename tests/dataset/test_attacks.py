@@ -170,6 +170,17 @@ def _many_episodes(manifest: dict) -> None:
     manifest["subsets"] = [manifest["subsets"][0] | {"name": f"hop/{n}", "episodes": 4 * 10**6} for n in range(3)]
 
 
+def _many_shards(manifest: dict) -> None:
+    others = [manifest["layers"][0] | {"name": f"a{n}/t", "group": f"a{n}.zarr/t"} for n in range(11)]
+    manifest["layers"] = [layer | {"shards": MAX_SHARDS} for layer in (*manifest["layers"], *others)]
+
+
+def _copy_of_everything(root: Path) -> None:
+    promised = {f"hop/{n}": ((0, MAX_SHARDS),) for n in range(11)}
+    copy = {"format": "dmcvb-gen copy", "manifest": sha256_bytes(_manifest_file(root).read_bytes()), "source": ""}
+    (root / "copy.json").write_bytes(canonical_json(copy | {"promised": promised}))
+
+
 def _infinite(root: Path) -> None:
     text = _manifest_file(root).read_text()
     _manifest_file(root).write_text(re.sub(r'"seconds_per_step":[0-9.]+', '"seconds_per_step":1e999', text))
@@ -177,6 +188,14 @@ def _infinite(root: Path) -> None:
 
 REFUSED = {
     "more episodes than the 10,000,000": _rewrite_manifest(_many_episodes),
+    "more shards than the .* release may have": _rewrite_manifest(_many_shards),
+    "not valid at the top: .*more shards than": _copy_of_everything,
+    "is no policy and no video": _rewrite_manifest(lambda m: m["inputs"].append(FILE | {"path": "recipes/0.json"})),
+    "holds no trajectories": _rewrite_manifest(lambda m: m["subsets"][0]["layers"].pop(0)),
+    "has no labels, or no renderer": _rewrite_manifest(lambda m: m["subsets"][0].update(renderer={})),
+    "was not written by dmcvb-gen, or changed": lambda root: _manifest_file(root).write_text(
+        json.dumps(json.loads(_manifest_file(root).read_bytes()), indent=1)
+    ),
     "appears twice": _rewrite_manifest(lambda m: m["layers"].append(m["layers"][0])),
     "seconds_per_step": _infinite,
     "renderer.samples": _rewrite_manifest(lambda m: m["subsets"][0].update(renderer={"samples": "\x1b]0;x\x07"})),

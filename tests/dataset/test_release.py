@@ -155,19 +155,22 @@ def test_what_is_parsed_is_bounded(store, monkeypatch, bound):
 
 
 REFUSED = {
-    "another seed": ({"makes": {"seed": 2}}, "seed 1, asked for 2"),
-    "another shard size": ({"episodes_per_shard": 3}, "episodes_per_shard 2, asked"),
+    "another seed": ({"makes": {"seed": 2}}, {}, "seed 1, asked for 2"),
+    "another shard size": ({"episodes_per_shard": 3}, {}, "episodes_per_shard 2, asked"),
+    "other styles": ({}, {"split": "val"}, "hop/random/none has split train, asked for val; choose another --out"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_recipe_that_contradicts_the_release_changes_nothing(store, name):
-    changes, message = REFUSED[name]
+    of_layer, of_subsets, message = REFUSED[name]
     made_up.make(store, made_up.recipe(2))
     before = store.list()
-    wanted, layer = made_up.recipe(4), made_up.TRAJECTORIES.model_copy(update=changes)
+    wanted, layer = made_up.recipe(4), made_up.TRAJECTORIES.model_copy(update=of_layer)
+    other = {"layers": (layer, *wanted.layers[1:])}
+    other |= {"subsets": tuple(subset.model_copy(update=of_subsets) for subset in wanted.subsets)}
     with pytest.raises(StoreError, match=message):
-        begin(store, wanted.model_copy(update={"layers": (layer, *wanted.layers[1:])}), {})
+        begin(store, wanted.model_copy(update=other), {})
     assert store.list() == before
 
 
