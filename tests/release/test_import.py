@@ -15,6 +15,7 @@ from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.repaint import Repainting, repaint
 from dmcvb_gen.release.card import check_card, write_card
 from dmcvb_gen.release.export import export
+from dmcvb_gen.release.export.episodes import png
 from dmcvb_gen.release.import_tfds import import_tfds
 from dmcvb_gen.release.tfrecord import encode_example, offsets, read_example, record
 from dmcvb_gen.release.verify import verify
@@ -105,6 +106,28 @@ def test_damaged_or_foreign_folders_are_not_imported(rlds, tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(StoreError, match="damaged"):
             import_tfds(tmp_path / "somewhere", tmp_path / "r", **what)
+
+
+ODD = {
+    r"RLDS episodes at byte \d+: no tf.train.Example \(": lambda example: b"\xff",
+    r"RLDS episodes at byte \d+: no tf.train.Example with features": lambda example: b"",
+    "an image of .* instead of 16": lambda example: encode_example(
+        example | {"steps/observation/pixels": [png(np.zeros((17, 16, 3), np.uint8))] * 501}
+    ),
+    "is not one of walker-walk: .steps/action": lambda example: encode_example(
+        {name: value for name, value in example.items() if name != "steps/action"}
+    ),
+}
+"""Refusal -> the bytes of a record, whose checksums are right, made of a whole one."""
+
+
+@pytest.mark.parametrize("said", ODD)
+def test_records_that_are_no_episodes_are_refused(said, rlds, tmp_path):
+    shutil.copytree(rlds, tmp_path / "odd")
+    [path] = (tmp_path / "odd").rglob("*.tfrecord-*")
+    path.write_bytes(record(ODD[said](read_example(path, *next(iter(offsets(path)))))))
+    with pytest.raises(StoreError, match=said):
+        import_tfds(tmp_path / "odd", tmp_path / "r", task="walker-walk", level="random", setting="static")
 
 
 @pytest.fixture(scope="module")
