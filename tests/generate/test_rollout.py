@@ -33,6 +33,8 @@ from tests.faults.commands import GRACE, session
 from tests.faults.inject import files_up_to
 
 NAME = "walker-walk/random/dynamic"
+ONE = b"{tasks: walker-walk, levels: random, settings: none, episodes: 1}"
+MAZES = b"{tasks: ant-maze-empty7x7, levels: random, settings: visible, episodes: 1}"
 TWICE = """name: dup
 base: &base {episodes: 1}
 subsets:
@@ -237,6 +239,8 @@ def test_a_recipe_is_narrowed_to_what_has_the_asked_names():
         (b"name: \xff", "UTF-8"),
         (b"a: b: c", "not YAML"),
         (b"", "holds no recipe; begin it with"),
+        (b"name: a\nsubsets: [%s, %s]" % (ONE, ONE), "asks for walker-walk/random/none twice; keep one"),
+        (b"name: a\nsubsets: [%s]" % MAZES.replace(b"episodes", b"steps"), "vary in length, so give episodes: N"),
         (TWICE.encode(), r"subsets is given twice \(line 7\); keep one$"),
     ],
 )
@@ -244,7 +248,7 @@ def test_what_is_no_recipe_is_refused_in_a_line(tmp_path, content, why):
     path = tmp_path / "recipe.yaml"
     path.write_bytes(content)
     with pytest.raises(RecipeError, match=why) as refused:
-        load_recipe(path)
+        expand(load_recipe(path))
     assert "\n" not in str(refused.value)
 
 
