@@ -122,7 +122,6 @@ OTHERS = [
     ("regenerate r --check --range 7:9", "no subset has episodes 7:9"),
     ("rollout --out r --no-pixels", "--no-pixels has no effect: a release goes on as it was begun"),
     ("verify s3://bucket/r --workers ray", "--workers has no effect"),
-    ("verify s3://bucket/r --backgrounds videos", "--backgrounds has no effect"),
     ("verify r --all", "--all has no effect"),
     ("verify r --option endpoint_url=http://127.0.0.1:1", "--option has no effect"),
     ("card r --check --url file:/x", "--check writes no card"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from dmcvb_gen.dataset import writer
+from dmcvb_gen.dataset.chunks import encode
 from dmcvb_gen.dataset.gate import Release
 from dmcvb_gen.errors import DmcvbError
 from dmcvb_gen.release.fetch import _Download, fetch
@@ -126,7 +127,7 @@ def _seen(root: Path, name: str) -> str | None:
 
 def _record_before_files(monkeypatch):
     def put_shard(store, layer, shard, arrays):
-        data = {name: writer.encode(layer, layer.array(name), values) for name, values in arrays}
+        data = {name: encode(layer, layer.array(name), values) for name, values in arrays}
         files = {name: writer.file_facts(each) for name, each in data.items() if each is not None}
         writer.put_record(store, layer, shard, writer.ShardRecord(key=layer.job_key(shard), files=files))
         for name in files:
