@@ -13,6 +13,7 @@ from dmcvb_gen.errors import DmcvbError, StoreError
 from dmcvb_gen.generate.modalities import stored_in
 from dmcvb_gen.generate.regenerate import Regeneration
 from dmcvb_gen.generate.repaint import Repainting, repaint
+from dmcvb_gen.release.fetch import fetch
 from dmcvb_gen.release.verify import verify
 from dmcvb_gen.rendering import available_renderers
 from dmcvb_gen.tasks import get_task
@@ -56,6 +57,12 @@ def test_a_repainted_release_is_sound_names_its_source_and_can_be_regenerated(dy
     source = Release.open(small_release)
     assert recipe.derived == {"kind": "repaint", "name": "small", "version": "1.0.0", "digest": source.digest}
     assert release.manifest.name == "small-repainted" and not release.shortfalls
+
+
+def test_a_part_is_repainted_as_the_part_that_it_is(small_release, tmp_path, no_simulation):
+    fetch(f"file:{small_release}", tmp_path / "part", ["*/static"])
+    release = repaint(Repainting(tmp_path / "part", tmp_path / "r", size=8))
+    assert list(release) == ["walker-walk/random/static"] and not release.unfinished
 
 
 def test_another_size_keeps_everything_but_the_pixels(small_release, tmp_path, no_simulation):
