@@ -37,7 +37,7 @@ def describe_release(path: str | Path, storage_options: dict | None = None) -> d
     Raises:
       StoreError: there is no release at `path`.
     """
-    from dmcvb_gen.dataset.gate import Release  # loads zarr, which `list` needs not
+    from dmcvb_gen.dataset.gate import Release  # here, so that `list` is quick
     from dmcvb_gen.generate.references import normalized, reference_returns
 
     release = Release.open(path, storage_options)
